@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .SILENT:
 .NOTPARALLEL:
-.PHONY: help setup demo test check lint formatted types contracts unit format lock images ray train install uninstall clean ready
+.PHONY: help setup demo test long check lint formatted types contracts house unit format lock images ray flower train docs bundle install uninstall clean ready
 
 # Taken as it is, without make expanding "$", and given on in the environment: any text may stand in it.
 override ASK := $(value ASK)
@@ -24,10 +24,15 @@ setup: ## Everything a gateway needs on this machine (as root: service user; oth
 demo: setup ## Start a fleet, run instructions on it, replay its log
 	$(RUN) swiftbot demo $${ASK:+"--ask=$$ASK"} $(TUI_FLAG)
 
-test: ## Set up and run everything: lint, types, import contracts, unit, integration and replay tests
+test: ## Set up and run the tests: lint, types, import contracts, unit, integration and replay tests but the long ones
 	scripts/setup.sh dev --with-browser
 	$(MAKE) --no-print-directory lint formatted types contracts READY=1
-	scripts/whole_suite.sh tests
+	scripts/whole_suite.sh -m 'not long' tests/unit tests/reports tests/replay tests/integration
+
+long: ## Set up and run the long tests
+	scripts/setup.sh dev --with-browser
+	$(MAKE) --no-print-directory docs
+	scripts/whole_suite.sh -m long tests/unit tests/reports tests/replay tests/integration
 
 # Types and tests take longest, and neither needs the other: at the same time.
 check: ready ## The fast part: lint, types, import contracts, unit tests but the long ones, with few examples of each property
@@ -53,20 +58,26 @@ types: ready ## Basedpyright, strict
 contracts: ready ## Import-linter: imports go downward only
 	$(RUN) lint-imports --no-cache
 
+house: ## Sizes: lines of code, modules, import chains, words to take out
+	/usr/bin/python3 scripts/house.py
+
 unit: ready ## Unit tests
 	$(PYTEST) tests/unit
 
 format: ready ## Ruff: fix what it can and format, in this tree
 	. scripts/common.sh && "$$VENV/bin/ruff" check --fix --quiet . ; "$$VENV/bin/ruff" format .
 
-lock: ready ## Pin the dependencies anew in locks/ (UPGRADE=1: newest versions)
+lock: ready ## Pin the dependencies in locks/ again (UPGRADE=1: newest versions)
 	. scripts/common.sh && export UV_SYSTEM_CERTS=1 && compile() { \
 	  "$$TOOLS/bin/uv" pip compile --quiet --python /usr/bin/python3 --generate-hashes --no-emit-index-url --no-header --no-annotate $(if $(UPGRADE),--upgrade) "$$@"; }; \
 	compile pyproject.toml -o locks/gateway.txt && \
 	compile pyproject.toml --group dev -c locks/gateway.txt --override locks/without.in -o locks/dev.txt && \
 	compile locks/tools.in -o locks/tools.txt && \
+	compile locks/docs.in -o locks/docs.txt && \
 	compile pyproject.toml --extra train -c locks/gateway.txt -o locks/train.txt && \
 	compile pyproject.toml --extra foxglove -c locks/gateway.txt -o locks/foxglove.txt && \
+	/usr/bin/python3 -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["flower"], sep="\n")' \
+	  | compile - -o locks/flower.txt && \
 	/usr/bin/python3 -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["bench"], sep="\n")' \
 	  | compile - -o locks/bench.txt
 
@@ -76,8 +87,19 @@ images: setup ## Build the container images (setup does so too)
 ray: ## Ray, which `swiftbot bench startup` compares with, in an environment of its own (220 MB)
 	scripts/setup.sh gateway --without-images --with-ray
 
+flower: ## Flower, which `swiftbot bench learn` compares with, in an environment of its own (5 GB)
+	scripts/setup.sh gateway --without-images --with-flower
+
+docs: ## The documentation as a site in build/docs, its links checked
+	scripts/setup.sh gateway --without-images --with-docs
+	. scripts/common.sh && NO_MKDOCS_2_WARNING=1 "$$DOCS/bin/mkdocs" build --quiet --strict --site-dir "$$PROJECT/build/docs"
+	echo build/docs/index.html
+
 train: ## What `swiftbot train` needs (PyTorch), in an environment of its own (5 GB)
 	scripts/setup.sh gateway --without-images --with-train
+
+bundle: setup ## One signed file that installs without a network (KEY=file of `swiftbot release key`, OUT=file)
+	KEY="$(KEY)" OUT="$(OUT)" scripts/bundle.sh
 
 install: ## Install as systemd services on this machine (DESTDIR=… for a package)
 	DESTDIR="$(DESTDIR)" scripts/install.sh

@@ -1,10 +1,10 @@
 """What a person's command does over Zenoh: one small client for the command line, the demo and the benchmarks.
 
-It sits anywhere on the Zenoh network, asks any gateway, and knows nothing of a gateway's inside.
+It sits anywhere on the Zenoh network and asks any gateway by its verbs (`model.keyspace`).
 
 What an operator may order (`SteeringCalls`): approve, pause, retry, stop robots, take one over, answer. Every order
-is signed with the operator's name, carries why and an id of its own, so that one that is repeated because an answer
-was lost is still one order; gateways put what came of it on the audit's key (`operator/act/{gateway}`).
+is labelled with the operator's name, a reason and an ID of its own, so that one that is repeated because an answer
+was lost is still one order; gateways publish its outcome on the audit's key (`operator/act/{gateway}`).
 
 Soft stops go by the names that people type: "Rover_1" and "rover 1" are `rover_1`; an unknown name stops none.
 """
@@ -12,11 +12,12 @@ Soft stops go by the names that people type: "Rover_1" and "rover 1" are `rover_
 import asyncio
 import contextlib
 import difflib
+import hashlib
 import re
 import time
 import uuid
 from collections.abc import AsyncGenerator, Sequence
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import msgspec
 from msgspec import Struct
@@ -25,6 +26,7 @@ from msgspec.structs import replace
 from appliance.connection import Endpoint, FleetConnection
 from appliance.errors import (
     DeadlineError,
+    NotFoundError,
     PayloadError,
     RefusedError,
     RobotError,
@@ -32,7 +34,6 @@ from appliance.errors import (
     UnreachableError,
     from_code,
 )
-from appliance.llm.api import SwapAsk, Swapped
 from appliance.llm.stop_words import stop_request
 from appliance.model import (
     Act,
@@ -48,13 +49,36 @@ from appliance.model import (
     TaskRecord,
     TaskRequest,
     TaskState,
-    encode,
+    keyspace,
 )
-from appliance.model.steering import MAX_STOPPED, MAX_WHY
-from appliance.plane.dedup import Deduplicator
-from appliance.pool.api import DecisionList, DecisionsAsk, EvictAsk, Evicted, ReleaseAsk, Released, WarmAsk, Warmed
-from appliance.pool.transfer.protocol import Brought, FetchAsk
-from appliance.robots.api import (
+from appliance.model.alerts import MOST_ACKED, Alert, AlertAck, AlertList, AlertsAcked, AlertsAsk
+from appliance.model.closures import CloseAsk, Closure, ClosureList, ClosuresAsk, ReopenAsk
+from appliance.model.learn_api import (
+    LearnEvalAsk,
+    LearnEvaluated,
+    LearnExportAsk,
+    LearnExported,
+    LearnRunsAsk,
+    LearnShowAsk,
+    LearnShown,
+    LearnStartAsk,
+    LearnSteerAsk,
+    Steering,
+)
+from appliance.model.learning import Recipe, Reference, RunRecord
+from appliance.model.plane_api import RosterAsk, RosterTold
+from appliance.model.planner_api import SwapAsk, Swapped
+from appliance.model.pool_api import (
+    DecisionList,
+    DecisionsAsk,
+    EvictAsk,
+    Evicted,
+    ReleaseAsk,
+    Released,
+    WarmAsk,
+    Warmed,
+)
+from appliance.model.robot_api import (
     LEASE_S,
     DriveAsk,
     Forgotten,
@@ -73,12 +97,25 @@ from appliance.robots.api import (
     StopAsk,
     TakeAsk,
 )
-from appliance.robots.sender import tell_to_hold
-from appliance.tasks.api import (
-    ActList,
+from appliance.model.schedules import (
+    InstructionList,
+    InstructionRemove,
+    InstructionsAsk,
+    InstructionSave,
+    SavedInstruction,
+    Schedule,
+    ScheduleAdd,
+    ScheduleList,
+    SchedulesAsk,
+    ScheduleSpec,
+    ScheduleSteer,
+)
+from appliance.model.steering import MAX_STOPPED, MAX_WHY
+from appliance.model.task_api import (
     ActsAsk,
     AnswerAsk,
     ApproveAsk,
+    ArtifactAsk,
     CancelTaskAsk,
     DrainAsk,
     DrainState,
@@ -87,10 +124,10 @@ from appliance.tasks.api import (
     EnquiryList,
     ExperienceAsk,
     ExperienceList,
+    Line,
     MigrateAsk,
     Migrated,
     MoveAsk,
-    MoveCancelled,
     PauseAsk,
     PlanAnswer,
     PlanAsk,
@@ -103,14 +140,21 @@ from appliance.tasks.api import (
     TaskAsk,
     TaskList,
     TasksAsk,
+    TaskWhy,
     UndrainAsk,
     WhyAsk,
 )
-from appliance.tasks.lines import Line
-from appliance.tasks.migration.moving import MOVE_S
+from appliance.model.transfer_api import Brought, FetchAsk
+from appliance.plane.dedup import Deduplicator
+from appliance.robots.sender import tell_to_hold
 from appliance.tasks.stream import Stream
-from appliance.tasks.views import TaskWhy
 
+LEARN_LOOK_S = 0.5
+"""How often a run of federated learning is asked for while it is followed."""
+WATCH_SILENCE_S = 3.0
+"""Longer than the pause between two signs of life of a run (`pool.runs.ALIVE_S`)."""
+MOST_SILENT = 10
+"""Failed looks in a row after which a watcher gives up."""
 STOP_S = 6.0
 """How long a stop waits to be confirmed: by then it has long been put."""
 SWAP_S = 300.0
@@ -169,51 +213,192 @@ class SteeringCalls(FleetConnection):
             why: for the audit.
 
         Raises:
-            ConflictError: somebody was faster (the message says who), or another plan waits by now.
+            ConflictError: another operator was faster (the message says who), or another plan waits by now.
             PlanError: the edited plan is not valid; `problems` says why, and the task waits on.
             RefusedError: nothing waits.
         """
         ask = ApproveAsk(id=task, hash=plan_hash, plan=plan, **self._sign(why))
-        return await self._ask("approve", ask, TaskRecord)
+        return await self._ask(keyspace.APPROVE, ask)
 
     async def reject(self, task: str, *, why: str = "", plan_hash: str = "") -> TaskRecord:
         """Turn the plan that waits down. Errors as `approve`."""
-        return await self._ask("reject", RejectAsk(id=task, hash=plan_hash, **self._sign(why)), TaskRecord)
+        return await self._ask(keyspace.REJECT, RejectAsk(id=task, hash=plan_hash, **self._sign(why)))
 
     async def check_plan(self, plan: Plan, *, task: str = "") -> PlanChecked:
         """What is wrong with a plan just now, and its hash; runs nothing."""
-        return await self._ask("plan_check", PlanCheckAsk(plan=plan, task=task), PlanChecked)
+        return await self._ask(keyspace.PLAN_CHECK, PlanCheckAsk(plan=plan, task=task))
 
     async def pause(self, task: str, *, hold: bool = False, why: str = "") -> TaskRecord:
         """Start no further subtask of a task; with `hold`, end runs that go on from a checkpoint later."""
-        return await self._ask("pause", PauseAsk(id=task, hold=hold, **self._sign(why)), TaskRecord)
+        return await self._ask(keyspace.PAUSE, PauseAsk(id=task, hold=hold, **self._sign(why)))
 
     async def resume(self, task: str, *, why: str = "") -> TaskRecord:
         """Take an operator's pause back; RefusedError where there is none, or a soft stop is the reason."""
-        return await self._ask("resume", ResumeAsk(id=task, **self._sign(why)), TaskRecord)
+        return await self._ask(keyspace.RESUME, ResumeAsk(id=task, **self._sign(why)))
 
     async def retry(self, task: str, subtask: str = "", *, why: str = "") -> TaskRecord:
         """Try again what failed or was cancelled; what has succeeded is kept."""
-        return await self._ask("retry", RetryAsk(id=task, subtask=subtask, **self._sign(why)), TaskRecord)
+        return await self._ask(keyspace.RETRY, RetryAsk(id=task, subtask=subtask, **self._sign(why)))
 
     async def cancel(self, task: str, *, why: str = "") -> TaskRecord:
         """Stop a task; returns what came of it, which `cancel_outcome` says in words."""
-        return await self._ask("cancel", CancelTaskAsk(id=task, **self._sign(why)), TaskRecord)
+        return await self._ask(keyspace.CANCEL, CancelTaskAsk(id=task, **self._sign(why)))
 
     async def enquiries(self) -> EnquiryList:
         """Questions of skills and robots that wait for an answer, oldest first."""
-        return await self._ask("enquiries", EnquiriesAsk(), EnquiryList)
+        return await self._ask(keyspace.ENQUIRIES, EnquiriesAsk())
 
     async def answer(self, enquiry: str, text: str, *, why: str = "") -> Enquiry:
-        """Answer a question; ConflictError with who answered when somebody was faster."""
-        return await self._ask("answer", AnswerAsk(id=enquiry, answer=text, **self._sign(why)), Enquiry)
+        """Answer a question; ConflictError with who answered when another operator was faster."""
+        return await self._ask(keyspace.ANSWER, AnswerAsk(id=enquiry, answer=text, **self._sign(why)))
+
+    async def alerts(self) -> AlertList:
+        """What operators have to know of and do something about, the most urgent first."""
+        return await self._ask(keyspace.ALERTS, AlertsAsk())
+
+    async def acknowledge(self, ids: Sequence[str], *, why: str = "") -> AlertsAcked:
+        """Acknowledge alerts; who was first stands there, and `unknown` has those that are over.
+
+        Raises:
+            NotFoundError: none of them is there.
+        """
+        found = AlertsAcked()
+        for first in range(0, len(ids), MOST_ACKED):
+            ask = AlertAck(ids=tuple(ids[first : first + MOST_ACKED]), **self._sign(why))
+            some = await self._ask(keyspace.ALERT_ACK, ask)
+            found = AlertsAcked(alerts=found.alerts + some.alerts, unknown=found.unknown + some.unknown)
+        if not found.alerts:
+            names = ", ".join(found.unknown)[:200]
+            raise NotFoundError(f"no alert {names}: it is over, or never was", remedy="see `swiftbot alerts`")
+        return found
 
     async def acts(self, limit: int = 100) -> tuple[tuple[Act, ...], dict[str, SwiftbotError]]:
         """What operators ordered lately, newest first; and which gateways did not tell, and why."""
         await self.gateway()
-        found, failed = await self._each("", "acts", ActsAsk(limit=limit), ActList)
+        found, failed = await self._each("", keyspace.ACTS, ActsAsk(limit=limit))
         acts = {each.id: each for answer in found.values() for each in answer.acts}
         return tuple(sorted(acts.values(), key=lambda each: each.at_ns, reverse=True)[:limit]), failed
+
+    # --- places and robots out of use -----------------------------------------------------------------------------
+
+    async def close_place(self, name: str, *, until_ns: int = 0, why: str = "") -> Closure:
+        """Close a place: no task goes there until it is opened, or until a moment, Unix nanoseconds."""
+        return await self._ask(keyspace.CLOSE, CloseAsk(kind="place", name=name, until_ns=until_ns, **self._sign(why)))
+
+    async def maintain(self, robot: str, *, until_ns: int = 0, why: str = "") -> Closure:
+        """Take a robot into maintenance: tasks command it no more; an operator who takes it over does."""
+        return await self._ask(keyspace.CLOSE, CloseAsk(kind="robot", name=robot, until_ns=until_ns, **self._sign(why)))
+
+    async def reopen(self, kind: Literal["place", "robot"], name: str, *, why: str = "") -> Closure:
+        """Open a place, or end a robot's maintenance; NotFoundError where it is not out of use."""
+        return await self._ask(keyspace.REOPEN, ReopenAsk(kind=kind, name=name, **self._sign(why)))
+
+    async def closures(self) -> ClosureList:
+        """Places and robots that are out of use, as any one gateway knows them."""
+        return await self._ask(keyspace.CLOSURES, ClosuresAsk())
+
+    # --- schedules and saved instructions -------------------------------------------------------------------------
+
+    async def schedule_add(self, spec: ScheduleSpec, *, why: str = "") -> Schedule:
+        """Add a schedule; the same again is the same one.
+
+        Raises:
+            PayloadError: an interval, expression, zone or time that cannot be.
+            RefusedError: the name is taken, or the instruction is a stop.
+        """
+        return await self._ask(keyspace.SCHEDULE_ADD, ScheduleAdd(spec=spec, **self._sign(why)))
+
+    async def schedule_steer(self, name: str, do: Literal["pause", "resume", "remove"], *, why: str = "") -> Schedule:
+        """Pause, resume or remove a schedule; NotFoundError where there is none of that name."""
+        return await self._ask(keyspace.SCHEDULE_STEER, ScheduleSteer(id=name, do=do, **self._sign(why)))
+
+    async def schedules(self) -> ScheduleList:
+        """All schedules, by name, and when each is due next."""
+        return await self._ask(keyspace.SCHEDULES, SchedulesAsk())
+
+    async def instruction_save(
+        self, name: str, text: str, *, about: str = "", replace: bool = False, why: str = ""
+    ) -> SavedInstruction:
+        """Save an instruction with parameters; RefusedError where the name is taken and is not to be replaced."""
+        ask = InstructionSave(id=name, text=text, about=about, replace=replace, **self._sign(why))
+        return await self._ask(keyspace.INSTRUCTION_SAVE, ask)
+
+    async def instruction_remove(self, name: str, *, why: str = "") -> SavedInstruction:
+        """Remove a saved instruction; NotFoundError where there is none of that name."""
+        return await self._ask(keyspace.INSTRUCTION_REMOVE, InstructionRemove(id=name, **self._sign(why)))
+
+    async def instructions(self) -> InstructionList:
+        """All saved instructions, by name."""
+        return await self._ask(keyspace.INSTRUCTIONS, InstructionsAsk())
+
+    # --- federated learning ---------------------------------------------------------------------------------------
+
+    async def learn_start(self, run: str, recipe: Recipe, *, why: str = "") -> RunRecord:
+        """Begin a run; the same again is the same run."""
+        return await self._ask(keyspace.LEARN_START, LearnStartAsk(id=run, recipe=recipe, **self._sign(why)))
+
+    async def learn_runs(self) -> tuple[tuple[RunRecord, ...], dict[str, SwiftbotError]]:
+        """All runs, newest first; and which gateways did not tell, and why."""
+        await self.gateway()
+        found, failed = await self._each("", keyspace.LEARN_RUNS, LearnRunsAsk())
+        runs: dict[str, RunRecord] = {}
+        for run in (run for answer in found.values() for run in answer.runs):
+            if run.id not in runs or run.updated_ns > runs[run.id].updated_ns:
+                runs[run.id] = run
+        return tuple(sorted(runs.values(), key=lambda run: (-run.started_ns, run.id))), failed
+
+    async def learn_show(self, run: str) -> LearnShown:
+        """One run, with its round as the round's coordinator knows it."""
+        return await self._ask(keyspace.LEARN_SHOW, LearnShowAsk(run=run))
+
+    async def learn_watch(self, run: str) -> AsyncGenerator[LearnShown]:
+        """Yield a run as it is, twice a second; it never ends by itself, and outlasts gateways that do not answer.
+
+        Raises:
+            SwiftbotError: it is not known, or nobody answers the first question.
+        """
+        yield await self.learn_show(run)
+        while True:
+            await asyncio.sleep(LEARN_LOOK_S)
+            with contextlib.suppress(UnreachableError, DeadlineError):
+                yield await self.learn_show(run)
+
+    async def learn_steer(
+        self, run: str, do: Steering, *, client: str = "", model: int = 0, why: str = ""
+    ) -> RunRecord:
+        """Pause, resume or stop a run, exclude or include a client, mark a model."""
+        ask = LearnSteerAsk(run=run, do=do, client=client, model=model, **self._sign(why))
+        return await self._ask(keyspace.LEARN_STEER, ask)
+
+    async def learn_eval(self, run: str, *, model: int | None = None, limit: int | None = None) -> LearnEvaluated:
+        """Evaluate a model that a run keeps on its data set's test part."""
+        return await self._ask(keyspace.LEARN_EVAL, LearnEvalAsk(run=run, model=model, limit=limit))
+
+    async def learn_export(self, run: str, *, model: int | None = None) -> LearnExported:
+        """Have a model that a run keeps written as an ONNX file."""
+        return await self._ask(keyspace.LEARN_EXPORT, LearnExportAsk(run=run, model=model))
+
+    async def artifact(self, reference: Reference) -> bytes:
+        """Fetch a file from the gateways, verified.
+
+        Raises:
+            NotFoundError: no gateway that answers has it.
+            PayloadError: what they have does not match its digest.
+        """
+        digest, first = str(reference.get("artifact", "")), str(reference.get("gateway", ""))
+        await self.gateway()
+        for member in sorted(self.plane.members(), key=lambda name: (name != first, name)):
+            data = bytearray()
+            with contextlib.suppress(NotFoundError, UnreachableError, DeadlineError):
+                while True:
+                    ask = ArtifactAsk(artifact=digest, offset=len(data))
+                    piece = await self.plane.rpc.call(member, keyspace.ARTIFACT, ask)
+                    data += piece.data
+                    if len(data) >= piece.size or not piece.data:
+                        break
+                if hashlib.sha256(data).hexdigest() == digest:
+                    return bytes(data)
+        raise NotFoundError(f"file {digest[:12]}… is on no gateway that answers")
 
     # --- robots -------------------------------------------------------------------------------------------------
 
@@ -224,8 +409,8 @@ class SteeringCalls(FleetConnection):
     async def stop(self, robots: Sequence[str] = (), *, why: str = "") -> StopAnswer:
         """Soft stop of some robots, or of the fleet: they hold, and are given no command until `resume_robots`.
 
-        It is put before anybody is asked, so that every gateway that hears it acts on it, whoever answers; when none
-        does, the robots that speak Zenoh themselves are told from here. Not a safety-rated emergency stop.
+        It is published before any gateway is asked, so that every gateway that hears it acts on it; when none answers,
+        the Zenoh robots are stopped from here. Not a safety-rated emergency stop.
 
         Raises:
             UnreachableError, DeadlineError: no gateway confirms that it is kept; the message says what was told.
@@ -234,10 +419,10 @@ class SteeringCalls(FleetConnection):
         stop = SoftStop(
             id=signed["act"], robots=tuple(robots), by=signed["by"], why=signed["why"], at_ns=time.time_ns()
         )
-        self.plane.session.put(self.plane.keys.soft_stop(stop.id), encode(stop))
+        self.plane.session.publish(keyspace.STOP, stop, stop.id)
         try:
             return await self._ask(
-                "soft_stop", StopAsk(robots=stop.robots, **signed), StopAnswer, timeout_s=STOP_S, patience_s=STOP_S
+                keyspace.SOFT_STOP, StopAsk(robots=stop.robots, **signed), timeout_s=STOP_S, patience_s=STOP_S
             )
         except (UnreachableError, DeadlineError) as error:
             names = stop.robots or tuple(self.plane.registry.robots)
@@ -259,28 +444,32 @@ class SteeringCalls(FleetConnection):
         """
         seen = tuple(stops) or tuple(each.id for each in (await self.standing()).active)
         ask = ResumeRobotsAsk(robots=tuple(robots), stops=seen, **self._sign(why))
-        return await self._ask("soft_resume", ask, StopAnswer)
+        return await self._ask(keyspace.SOFT_RESUME, ask)
+
+    async def hand_roster(self, number: int, sealed: bytes) -> RosterTold:
+        """Give a gateway the authority's roster, as its file has it; all others have it within seconds."""
+        return await self._ask(keyspace.ROSTER, RosterAsk(number=number, sealed=sealed))
 
     async def standing(self) -> Standing:
         """The soft stops and leases in force, as any one gateway knows them."""
-        return await self._ask("standing", StandingAsk(), Standing)
+        return await self._ask(keyspace.STANDING, StandingAsk())
 
     async def take_over(self, robot: str, *, lease_s: float = LEASE_S, why: str = "") -> Lease:
         """Take a robot over: from now on only commands with this lease move it; renew it before `lease_s` is over.
 
         Raises:
-            ConflictError: somebody else has it; the message says who.
+            ConflictError: another operator has it; the message says who.
             NotFoundError: there is no such robot.
         """
-        return await self._ask("control_take", TakeAsk(robot=robot, lease_s=lease_s, **self._sign(why)), Lease)
+        return await self._ask(keyspace.CONTROL_TAKE, TakeAsk(robot=robot, lease_s=lease_s, **self._sign(why)))
 
     async def renew(self, lease: Lease) -> Lease:
         """Keep a robot; ConflictError when the lease has ended, and with whom the robot is."""
-        return await self._ask("control_renew", RenewAsk(robot=lease.robot, lease=lease.id), Lease, patience_s=2.0)
+        return await self._ask(keyspace.CONTROL_RENEW, RenewAsk(robot=lease.robot, lease=lease.id), patience_s=2.0)
 
     async def give_back(self, lease: Lease, *, why: str = "") -> Lease:
         """Have a robot hold, and give it back to the tasks."""
-        return await self._ask("control_give", GiveAsk(robot=lease.robot, lease=lease.id, **self._sign(why)), Lease)
+        return await self._ask(keyspace.CONTROL_GIVE, GiveAsk(robot=lease.robot, lease=lease.id, **self._sign(why)))
 
     async def drive(self, lease: Lease, verb: str, *, timeout_s: float = 5.0, **args: Any) -> RobotReply:
         """Have a robot do a verb under a lease; RobotError and others with the robot's reason when it does not.
@@ -290,7 +479,7 @@ class SteeringCalls(FleetConnection):
         """
         ask = DriveAsk(robot=lease.robot, lease=lease.id, verb=verb, args=args, timeout_s=timeout_s)
         gateway = await self.gateway()
-        reply = await self.plane.rpc.call(gateway, "control_move", ask, RobotReply, timeout_s=timeout_s + 1.0)
+        reply = await self.plane.rpc.call(gateway, keyspace.CONTROL_MOVE, ask, timeout_s=timeout_s + 1.0)
         if (failure := reply.failure) is not None:
             error = from_code(failure.code, failure.message, failure.remedy)
             raise error if type(error) is not SwiftbotError else RobotError(failure.message, remedy=failure.remedy)
@@ -308,7 +497,7 @@ class SteeringCalls(FleetConnection):
         """
         await self._known(gateway)
         ask = SwapAsk(folder=folder, **self._sign(why))
-        return await self.plane.rpc.call(gateway, "llm_swap", ask, Swapped, timeout_s=SWAP_S)
+        return await self.plane.rpc.call(gateway, keyspace.LLM_SWAP, ask, timeout_s=SWAP_S)
 
 
 def read_plan_file(data: bytes) -> Plan:
@@ -332,42 +521,87 @@ def _news(last: TaskRecord, record: TaskRecord) -> bool:
 
 
 class FleetClient(SteeringCalls):
-    """All that can be asked of a fleet; use it as an async context manager."""
+    """Client of a fleet; use it as an async context manager."""
 
     async def plan(self, instruction: str, *, private: bool = False) -> PlanAnswer:
         """Decompose, run nothing; `private`: ask no other machine."""
         asked = PlanAsk(instruction=instruction, private=private)
-        return await self._ask("plan", asked, PlanAnswer, timeout_s=60.0)
+        return await self._ask(keyspace.PLAN, asked)
 
     async def experience(self, limit: int, gateway: str = "") -> ExperienceList:
         """How skills have done on robots lately, by what a gateway has heard; any gateway's by default."""
         asked = ExperienceAsk(limit=limit)
         if not gateway:
-            return await self._ask("experience", asked, ExperienceList)
+            return await self._ask(keyspace.EXPERIENCE, asked)
         await self._known(gateway)
-        return await self.plane.rpc.call(gateway, "experience", asked, ExperienceList)
+        return await self.plane.rpc.call(gateway, keyspace.EXPERIENCE, asked)
 
     async def submit(self, request: TaskRequest) -> TaskRecord:
-        """Hand in a task; durable when this returns. It gets its id here, so that asking twice is one task."""
+        """Submit a task; durable when this returns. It gets its id here, so that asking twice is one task."""
         if not request.id:
             request = replace(request, id=f"t-{uuid.uuid4().hex[:10]}")
-        return await self._ask("submit", request, TaskRecord, timeout_s=6.0, patience_s=15.0)
+        return await self._ask(keyspace.SUBMIT, request, patience_s=15.0)
 
     async def task(self, task: str) -> TaskRecord:
         """One task's record."""
-        return await self._ask("task", TaskAsk(id=task), TaskRecord)
+        return await self._ask(keyspace.TASK, TaskAsk(id=task))
 
-    async def tasks(self, limit: int) -> TaskList:
-        """The newest tasks of the fleet."""
-        return await self._ask("tasks", TasksAsk(limit=limit), TaskList)
+    async def tasks(
+        self, limit: int = 100, *, wanted: TasksAsk | None = None, after: TaskRecord | None = None
+    ) -> TaskList:
+        """The newest tasks of the fleet, `more`: there are older ones.
+
+        Args:
+            limit: how many at most.
+            wanted: which; None: all that are kept whole.
+            after: the last task of the page before.
+        """
+        ask = replace(wanted or TasksAsk(), limit=limit)
+        if after is not None:
+            ask = replace(ask, before_ns=after.created_ns, before=after.id)
+        return await self._ask(keyspace.TASKS, ask)
+
+    async def history(self, wanted: TasksAsk) -> AsyncGenerator[TaskList]:
+        """Yield the tasks that are meant page after page, to the oldest; a page is at most `wanted.limit` long."""
+        after: TaskRecord | None = None
+        while True:
+            page = await self.tasks(wanted.limit, wanted=wanted, after=after)
+            yield page
+            if not page.more or not page.tasks:
+                return
+            after = page.tasks[-1]
+
+    async def duplicate(self, task: str) -> TaskRecord:
+        """Submit a task's instruction once more, as a new task of this operator; it is planned and reviewed again.
+
+        Priority, gateways, approval and time allowed are those of the task.
+
+        Raises:
+            NotFoundError: there is no such task.
+            RefusedError: its instruction, or the plan that was submitted with it, is not kept as it was.
+        """
+        known = await self.task(task)
+        if known.remembered is not None and known.instruction.endswith("…"):  # cut: see `tasks.records.trimmed`
+            raise RefusedError(
+                f"task {task} is remembered by the beginning of its instruction only",
+                remedy=f"submit the whole instruction: {known.instruction}",
+            )
+        if known.handed_in and (known.plan is None or known.revised):
+            raise RefusedError(f"the plan that came with task {task} is not kept as it was", remedy="submit it again")
+        request = TaskRequest(
+            instruction=known.instruction, submitter=self.operator, priority=known.priority,
+            deadline_s=known.deadline_s, group=known.within, approval=known.approval,
+            plan=known.plan if known.handed_in else None,
+        )  # fmt: skip
+        return await self.submit(request)
 
     async def site(self) -> Site:
         """The map by which any one gateway understands names of places."""
-        return await self._ask("site", SiteAsk(), Site)
+        return await self._ask(keyspace.SITE, SiteAsk())
 
     async def why(self, task: str, subtask: str = "") -> TaskWhy:
         """Why a task waits, or was served where it was; NotFoundError when there is no such task or subtask."""
-        return await self._ask("why", WhyAsk(id=task, subtask=subtask), TaskWhy)
+        return await self._ask(keyspace.WHY, WhyAsk(id=task, subtask=subtask))
 
     # --- moving runs --------------------------------------------------------------------------------------------
 
@@ -376,38 +610,36 @@ class FleetClient(SteeringCalls):
 
         Raises:
             NotFoundError, RefusedError: it cannot be moved, with the reason; it goes on where it is.
-            CancelledByOperatorError: somebody called it off.
+            CancelledByOperatorError: an operator called it off.
         """
         signed = replace(ask, by=ask.by or self.operator)
-        return await self.plane.rpc.call(await self.gateway(), "migrate", signed, Migrated, timeout_s=MOVE_S)
+        return await self.plane.rpc.call(await self.gateway(), keyspace.MIGRATE, signed)
 
     async def migrate_cancel(self, task: str, subtask: str) -> bool:
         """Call off a move that is under way; False when it is too late, or there is none."""
         ask = MoveAsk(task=task, subtask=subtask)
-        return (await self._ask("migrate_cancel", ask, MoveCancelled)).cancelled
+        return (await self._ask(keyspace.MIGRATE_CANCEL, ask)).cancelled
 
     async def drain(self, gateway: str, deadline_s: float, *, why: str = "") -> DrainState:
         """Have a gateway give all its runs away and take no more; returns at once."""
         await self._known(gateway)
-        return await self.plane.rpc.call(
-            gateway, "drain", DrainAsk(deadline_s=deadline_s, **self._sign(why)), DrainState
-        )
+        return await self.plane.rpc.call(gateway, keyspace.DRAIN, DrainAsk(deadline_s=deadline_s, **self._sign(why)))
 
     async def undrain(self, gateway: str, *, why: str = "") -> DrainState:
         """Have a gateway take runs again."""
         await self._known(gateway)
-        return await self.plane.rpc.call(gateway, "undrain", UndrainAsk(**self._sign(why)), DrainState)
+        return await self.plane.rpc.call(gateway, keyspace.UNDRAIN, UndrainAsk(**self._sign(why)))
 
     async def drain_state(self, gateway: str) -> DrainState:
         """How far a gateway is with giving its runs away."""
-        return await self.plane.rpc.call(gateway, "drain_state", DrainStateAsk(), DrainState)
+        return await self.plane.rpc.call(gateway, keyspace.DRAIN_STATE, DrainStateAsk())
 
     # --- MAVLink links -----------------------------------------------------------------------------------------
 
     async def robot_links(self, gateway: str = "") -> tuple[dict[str, LinkList], dict[str, SwiftbotError]]:
         """The MAVLink links of all gateways, or one; and why the others did not tell."""
         await self._known(gateway)
-        return await self._each(gateway, "robot_links", LinksAsk(), LinkList)
+        return await self._each(gateway, keyspace.ROBOT_LINKS, LinksAsk())
 
     async def robot_link_add(self, gateway: str, ask: LinkAdd) -> LinkFacts:
         """Have a gateway open a MAVLink link and keep it over restarts.
@@ -417,12 +649,12 @@ class FleetClient(SteeringCalls):
             RefusedError: there is such a link with other settings.
         """
         await self._known(gateway)
-        return await self.plane.rpc.call(gateway, "robot_link_add", ask, LinkFacts)
+        return await self.plane.rpc.call(gateway, keyspace.ROBOT_LINK_ADD, ask)
 
     async def robot_link_remove(self, gateway: str, ask: LinkRemove) -> LinkFacts:
         """Have a gateway close a MAVLink link for good; NotFoundError when it has none of that name."""
         await self._known(gateway)
-        return await self.plane.rpc.call(gateway, "robot_link_remove", ask, LinkFacts, timeout_s=15.0)
+        return await self.plane.rpc.call(gateway, keyspace.ROBOT_LINK_REMOVE, ask)
 
     async def robot_forget(self, ask: RobotForget) -> Forgotten:
         """Remove the row of a robot that is offline, at the gateway that it was attached to, where that is there.
@@ -434,7 +666,7 @@ class FleetClient(SteeringCalls):
         anyone = await self.gateway()
         known = self.plane.registry.robots.get(ask.robot)
         there = known is not None and known.gateway in self.plane.members()
-        return await self.plane.rpc.call(known.gateway if known and there else anyone, "robot_forget", ask, Forgotten)
+        return await self.plane.rpc.call(known.gateway if known and there else anyone, keyspace.ROBOT_FORGET, ask)
 
     # --- pools ------------------------------------------------------------------------------------------------
 
@@ -442,7 +674,7 @@ class FleetClient(SteeringCalls):
         """Have a gateway keep containers of an image ready."""
         await self._known(gateway)
         signed = replace(ask, by=ask.by or self.operator)
-        return await self.plane.rpc.call(gateway, "pool_warm", signed, Warmed, timeout_s=ask.wait_s + 5.0)
+        return await self.plane.rpc.call(gateway, keyspace.POOL_WARM, signed, timeout_s=ask.wait_s + 5.0)
 
     async def image_fetch(
         self, gateway: str, reference: str, source: str = "", *, timeout_s: float = 900.0, why: str = ""
@@ -454,7 +686,7 @@ class FleetClient(SteeringCalls):
         """
         await self._known(gateway)
         ask = FetchAsk(reference=reference, gateway=source, **self._sign(why))
-        return await self.plane.rpc.call(gateway, "image_fetch", ask, Brought, timeout_s=timeout_s)
+        return await self.plane.rpc.call(gateway, keyspace.IMAGE_FETCH, ask, timeout_s=timeout_s)
 
     def image_holders(self, reference: str) -> tuple[str, ...]:
         """Gateways whose status lists an image, by its full reference."""
@@ -481,42 +713,42 @@ class FleetClient(SteeringCalls):
         if held:
             where, container = min(held, key=lambda each: (each[1] != name, each))
             ask = EvictAsk(container=container, **self._sign(why))
-            return {where: await self.plane.rpc.call(where, "pool_evict", ask, Evicted)}
-        return await self._all_of(gateway, "pool_evict", EvictAsk(image=name, **self._sign(why)), Evicted)
+            return {where: await self.plane.rpc.call(where, keyspace.POOL_EVICT, ask)}
+        return await self._all_of(gateway, keyspace.POOL_EVICT, EvictAsk(image=name, **self._sign(why)))
 
     async def pool_release(self, image: str, gateway: str = "", *, why: str = "") -> dict[str, Released]:
         """Have an image started again that is in quarantine, on one gateway or wherever it is."""
         ask = ReleaseAsk(image=image, **self._sign(why))
-        return await self._all_of(gateway, "pool_release_quarantine", ask, Released)
+        return await self._all_of(gateway, keyspace.POOL_RELEASE_QUARANTINE, ask)
 
     async def pool_decisions(
         self, limit: int, gateway: str = ""
     ) -> tuple[dict[str, DecisionList], dict[str, SwiftbotError]]:
         """What pools started and gave up lately, by gateway; and why the others did not tell."""
         await self._known(gateway)
-        return await self._each(gateway, "pool_decisions", DecisionsAsk(limit=limit), DecisionList)
+        return await self._each(gateway, keyspace.POOL_DECISIONS, DecisionsAsk(limit=limit))
 
     # --- watching ---------------------------------------------------------------------------------------------
 
-    async def watch(self, task: str, *, poll_s: float = 1.0) -> AsyncGenerator[TaskRecord]:
+    async def watch(self, task: str, *, silence_s: float = WATCH_SILENCE_S) -> AsyncGenerator[TaskRecord]:
         """Yield a task's record whenever it changes, until it has ended; survives the loss of gateways.
 
-        Changes are pushed; every `poll_s` the record is asked for as well, in case a push was missed.
+        Changes are pushed. The record is asked for only after `silence_s` without a push of the record or a sign of
+        life of a run, in case a push was missed.
         """
-        queue: asyncio.Queue[TaskRecord] = asyncio.Queue()
-
-        def take(key: str, record: TaskRecord | None) -> None:  # noqa: ARG001 - the record names its task
-            if record is not None:
-                queue.put_nowait(record)
-
-        closer = self.plane.session.subscribe_typed(self.plane.keys.task(task), TaskRecord, take)
+        queue: asyncio.Queue[TaskRecord | None] = asyncio.Queue()
+        session, keys = self.plane.session, self.plane.keys
+        closers = (
+            session.subscribe_typed(keyspace.TASK_UPDATE, lambda _, record: queue.put_nowait(record), task),
+            session.subscribe(keys(keyspace.RUN_EVENT, task), lambda _: queue.put_nowait(None)),
+        )
         try:
             last: TaskRecord | None = None
             silent = 0
             queue.put_nowait(await self.task(task))
             while last is None or not last.state.final:
                 try:
-                    async with asyncio.timeout(poll_s):
+                    async with asyncio.timeout(silence_s):
                         record = await queue.get()
                 except TimeoutError:
                     try:
@@ -524,20 +756,21 @@ class FleetClient(SteeringCalls):
                         silent = 0
                     except SwiftbotError:
                         silent += 1
-                        if silent > 30:
+                        if silent > MOST_SILENT:
                             raise
                         continue
-                if last is None or _news(last, record):
+                if record is not None and (last is None or _news(last, record)):
                     last = record
                     yield record
         finally:
-            closer.close()
+            for closer in closers:
+                closer.close()
 
     async def stream(self, task: str, *, since_s: float | None = None) -> AsyncGenerator[Line]:
         """Yield what happens to a task, from all gateways in one order, until it has ended.
 
         Progress, log lines of handlers and of gateways, figures, what the monitor finds and does. What is still known
-        of the past comes first; the queue is bounded, and what it drops is told in the stream.
+        of the past comes first; the queue is bounded, and what it drops is noted in the stream.
 
         Args:
             task: its id.
@@ -555,7 +788,7 @@ class FleetClient(SteeringCalls):
         """Wait until a task has a plan or has ended."""
 
         async def wait() -> TaskRecord:
-            async with contextlib.aclosing(self.watch(task, poll_s=0.2)) as changes:
+            async with contextlib.aclosing(self.watch(task)) as changes:
                 async for record in changes:
                     if record.state is not TaskState.ACCEPTED:
                         return record
@@ -569,6 +802,10 @@ class FleetClient(SteeringCalls):
                 f"task {task} has no plan after {timeout_s:.0f} s", remedy=f"see `swiftbot task show {task}`"
             ) from None
 
+    def on_alert(self, take: "asyncio.Queue[Alert]") -> None:
+        """Have each change of an alert put into a queue; with `cleared_ns` it is over."""
+        self.plane.session.subscribe_typed(keyspace.ALERT, lambda _, alert: take.put_nowait(alert) if alert else None)
+
     def on_notice(self, take: "asyncio.Queue[Notice]") -> None:
         """Have notices to people put into a queue, each once: both sides of a partition may have given it."""
         once = Deduplicator()
@@ -577,12 +814,12 @@ class FleetClient(SteeringCalls):
             if notice is not None and once.new(notice.id):
                 take.put_nowait(notice)
 
-        self.plane.session.subscribe_typed(self.plane.keys.notice(), Notice, heard)
+        self.plane.session.subscribe_typed(keyspace.NOTICE, heard)
 
     def on_run(self, task: str, take: "asyncio.Queue[RunEvent]") -> None:
         """Have the events of a task's runs put into a queue."""
         self.plane.session.subscribe_typed(
-            self.plane.keys.run(task), RunEvent, lambda _, event: take.put_nowait(event) if event else None
+            keyspace.RUN_EVENT, lambda _, event: take.put_nowait(event) if event else None, task
         )
 
 
@@ -673,8 +910,8 @@ class Stopped(Struct, frozen=True, kw_only=True):
 
     def as_json(self) -> dict[str, Any]:
         """Return what `--json` prints: the answer's fields, and the names that no robot has."""
-        answer: dict[str, Any] = msgspec.to_builtins(self.answer or StopAnswer(stops=()))
-        return {**answer, "unknown": list(self.unknown)}
+        answer = self.answer or StopAnswer(stops=())
+        return {name: getattr(answer, name) for name in answer.__struct_fields__} | {"unknown": self.unknown}
 
     def text(self) -> str:
         """Return what is printed: what was not stopped or not confirmed first, in capitals."""
@@ -700,7 +937,7 @@ def answer_text(answer: StopAnswer, *, stopping: bool = False) -> str:
         lost = [*sorted(answer.problems), *(f"gateway {each}" for each in answer.silent)]
         lines.append(f"NOT CONFIRMED by {', '.join(lost)}: use the switch at a robot that moves")
     lines += [f"{', '.join(each.robots) or 'the fleet'}: {each.text}" for each in answer.stops] or [
-        "nothing is stopped"
+        "no soft stop is in force"
     ]
     if answer.robots:
         lines.append(f"hold: {', '.join(answer.robots)}")

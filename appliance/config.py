@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import msgspec
+import tomli_w
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, PayloadError
 from appliance.llm.settings import LlmConfig, SafetyConfig
-from appliance.plane.keys import check_name
-from appliance.plane.settings import PlaneConfig
+from appliance.model.keys import check_name
+from appliance.plane.settings import PlaneConfig, dialled_here
 from appliance.pool.settings import PoolConfig
 from appliance.record.settings import RecordConfig
 from appliance.robots.settings import RobotsConfig
@@ -44,7 +45,7 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     keep_containers: bool = True
     """On SIGTERM: leave warm containers running for the next start to adopt."""
     status_s: float = 2.0
-    """How often a gateway takes account of itself when nothing changes; a large fleet is told of it more rarely."""
+    """How often a gateway takes account of itself when nothing changes; a large fleet hears it less often."""
     plane: PlaneConfig = field(default_factory=PlaneConfig)
     pool: PoolConfig = field(default_factory=PoolConfig)
     llm: LlmConfig = field(default_factory=LlmConfig)
@@ -57,6 +58,16 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         """Where this gateway and the others are reached, by its configuration, each once."""
         others = (endpoint for name, endpoint in self.plane.peers.items() if name != self.id)
         return tuple(dict.fromkeys((*self.plane.listen, *self.plane.connect, *others)))
+
+    def dialling(self, keys: str = "") -> PlaneConfig:
+        """How a program beside this gateway, such as its recorder, links to it and to the others.
+
+        `keys`: the program's own; empty: the gateway's.
+        """
+        chosen = keys or self.plane.keys
+        # A certificate names addresses, and "any" is none.
+        endpoints = (dialled_here(each) for each in self.endpoints()) if chosen else self.endpoints()
+        return PlaneConfig(mode="peer", connect=tuple(endpoints), keys=chosen, roster=self.plane.roster)
 
 
 def load(path: Path) -> GatewayConfig:
@@ -89,7 +100,11 @@ def check(config: GatewayConfig, source: str) -> None:
         check_name(config.fleet, "fleet")
         config.plane.check()
         config.plane.check_own(config.id)
+        config.plane.check_links()
         config.robots.check()
+        if config.plane.keys:
+            for link in config.robots.mavlink:
+                link.check_keyed()
         config.record.check()
         config.llm.check()
         config.safety.check()
@@ -103,28 +118,12 @@ def check(config: GatewayConfig, source: str) -> None:
 
 def dump(config: GatewayConfig) -> str:
     """Write a configuration as TOML with all that differs from the defaults."""
-    lines: list[str] = []
-    tables: list[str] = []
     defaults = cast("dict[str, Any]", msgspec.to_builtins(GatewayConfig(id=config.id)))
+    written: dict[str, Any] = {"id": config.id}
     for key, value in cast("dict[str, Any]", msgspec.to_builtins(config)).items():
         if isinstance(value, dict):
             section = cast("dict[str, Any]", value)
-            changed = {k: v for k, v in section.items() if v != defaults[key].get(k)}
-            if changed:
-                tables += ["", f"[{key}]", *(f"{k} = {_toml(v)}" for k, v in changed.items())]
-        elif key == "id" or value != defaults[key]:
-            lines.append(f"{key} = {_toml(value)}")
-    return "\n".join([*lines, *tables, ""])
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, dict):
-        table = cast("dict[str, object]", value)
-        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(each)}" for key, each in table.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(each) for each in cast("list[object]", value)) + "]"
-    if isinstance(value, str):
-        return msgspec.json.encode(value).decode()
-    return repr(value)
+            written[key] = {name: each for name, each in section.items() if each != defaults[key].get(name)}
+        elif value != defaults[key]:
+            written[key] = value
+    return tomli_w.dumps({key: value for key, value in written.items() if value != {}})

@@ -1,25 +1,26 @@
 """A connection to a fleet: asks any gateway, and another one when that is gone. What is asked stands in `client`.
 
-It sits anywhere on the Zenoh network and knows nothing of a gateway's inside. The endpoints of a fleet that runs on
+It sits anywhere on the Zenoh network; no gateway need run in its process. The endpoints of a fleet that runs on
 this machine are found by its state file.
 """
 
 import asyncio
+import difflib
 import os
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Literal, Self
 
 import msgspec
 from msgspec import Struct
 
 from appliance.errors import ConfigError, DeadlineError, NotFoundError, SwiftbotError, UnreachableError
+from appliance.model.keys import Q, R, Verb
+from appliance.model.roles import Role
 from appliance.model.steering import MAX_BY
-from appliance.plane.node import PlaneClient
+from appliance.plane.client import PlaneClient
 from appliance.plane.settings import PlaneConfig
-
-R = TypeVar("R", bound=Struct)
 
 PATIENCE_S = 6.0
 """How long another gateway is looked for when the one that was asked is gone: detection takes a second."""
@@ -35,6 +36,12 @@ class Endpoint(Struct, frozen=True, kw_only=True):
 
     fleet: str
     connect: tuple[str, ...]
+    keys: str = ""
+    """File with the client's keys; empty: without, to gateways on this machine."""
+
+    def plane(self, mode: Literal["peer", "client"] = "client") -> PlaneConfig:
+        """How to connect, with plain settings otherwise."""
+        return PlaneConfig(mode=mode, connect=self.connect, keys=self.keys)
 
 
 class FleetConnection:
@@ -42,14 +49,16 @@ class FleetConnection:
 
     Args:
         endpoint: where the fleet is.
-        operator: signs orders.
+        operator: labels orders; with keys it is the name that these have.
         plane: how to connect, when it is not as a client with plain settings.
     """
 
     def __init__(self, endpoint: Endpoint, *, operator: str = "", plane: PlaneConfig | None = None) -> None:
         self.endpoint = endpoint
-        self._config = plane or PlaneConfig(mode="client", connect=endpoint.connect)
+        self._config = plane or endpoint.plane()
         self.operator = operator or operator_name()
+        self.role: Role | None = None
+        """What the certificate says that this one may do; None without keys, or before it is connected."""
         self._plane: PlaneClient | None = None
 
     async def open(self) -> Self:
@@ -57,6 +66,9 @@ class FleetConnection:
         if self._plane is not None:
             return self
         self._plane = await PlaneClient.open(self._config, fleet=self.endpoint.fleet)
+        if (credentials := self._plane.session.credentials) is not None:
+            # Gateways go by that name; it is shown and put as they will have it.
+            self.operator, self.role = credentials.identity.name, credentials.identity.role
         return self
 
     async def close(self) -> None:
@@ -85,7 +97,7 @@ class FleetConnection:
         return await self.plane.any_gateway()
 
     async def _ask(
-        self, verb: str, request: Struct, reply: type[R], *, timeout_s: float = 5.0, patience_s: float = PATIENCE_S
+        self, verb: Verb[Q, R], request: Q, *, timeout_s: float | None = None, patience_s: float = PATIENCE_S
     ) -> R:
         """Ask any gateway, and another one when it is gone or silent: every verb used here may be repeated."""
         give_up = time.monotonic() + patience_s
@@ -93,7 +105,7 @@ class FleetConnection:
         while True:
             gateway = await self.plane.any_gateway(avoid=silent)
             try:
-                return await self.plane.rpc.call(gateway, verb, request, reply, timeout_s=timeout_s)
+                return await self.plane.rpc.call(gateway, verb, request, timeout_s=timeout_s)
             except UnreachableError:
                 if time.monotonic() > give_up:
                     raise
@@ -108,15 +120,16 @@ class FleetConnection:
         """Raise when there is no such gateway, or none at all."""
         await self.gateway()
         if gateway and gateway not in self.plane.members():
-            known = ", ".join(sorted(self.plane.members()))
-            raise NotFoundError(f"no gateway {gateway[:60]!r} is there", remedy=f"there are: {known}")
+            members = sorted(self.plane.members())
+            near = difflib.get_close_matches(gateway, members, n=1)
+            there = f"there are: {', '.join(members)}"
+            remedy = f"did you mean {near[0]}? {there}" if near else there
+            raise NotFoundError(f"no gateway {gateway[:60]!r}", remedy=remedy)
 
-    async def _each(
-        self, gateway: str, verb: str, request: Struct, reply: type[R]
-    ) -> tuple[dict[str, R], dict[str, SwiftbotError]]:
+    async def _each(self, gateway: str, verb: Verb[Q, R], request: Q) -> tuple[dict[str, R], dict[str, SwiftbotError]]:
         """Ask one gateway, or all; what they answered, and why some did not."""
         names = [gateway] if gateway else sorted(self.plane.members())
-        calls = (self.plane.rpc.call(name, verb, request, reply) for name in names)
+        calls = (self.plane.rpc.call(name, verb, request) for name in names)
         found: dict[str, R] = {}
         failed: dict[str, SwiftbotError] = {}
         for name, answer in zip(names, await asyncio.gather(*calls, return_exceptions=True), strict=True):
@@ -128,10 +141,10 @@ class FleetConnection:
                 found[name] = answer
         return found, failed
 
-    async def _all_of(self, gateway: str, verb: str, request: Struct, reply: type[R]) -> dict[str, R]:
+    async def _all_of(self, gateway: str, verb: Verb[Q, R], request: Q) -> dict[str, R]:
         """The same, but when none did what was asked, the reason of the first is raised."""
         await self._known(gateway)
-        found, failed = await self._each(gateway, verb, request, reply)
+        found, failed = await self._each(gateway, verb, request)
         if not found:
             raise failed[min(failed)]
         return found
@@ -156,11 +169,13 @@ class FleetState(Struct, frozen=True, kw_only=True):
     robots: tuple[str, ...]
     record_dir: str
     processes: tuple[Process, ...]
+    keys: str = ""
+    """Keys that commands on this machine use; empty: the fleet has none."""
 
     @property
     def endpoint(self) -> Endpoint:
         """Where clients connect."""
-        return Endpoint(fleet=self.fleet, connect=self.endpoints)
+        return Endpoint(fleet=self.fleet, connect=self.endpoints, keys=self.keys)
 
 
 def default_directory(fleet: str) -> Path:
@@ -184,4 +199,4 @@ def read_state(directory: Path) -> FleetState:
             f"{path} cannot be read: {error.strerror}", remedy="give a --dir that is a readable folder"
         ) from error
     except msgspec.DecodeError as error:
-        raise ConfigError(f"{path} cannot be read: {error}", remedy="remove it and start the fleet anew") from error
+        raise ConfigError(f"{path} cannot be read: {error}", remedy="remove it and start the fleet again") from error

@@ -4,19 +4,19 @@ Of plans also where they came from, what they ask for, how they were revised, an
 out whether it writes to a terminal: without one there are no colours and no live region.
 """
 
+from __future__ import annotations
+
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from appliance.doctor import Check
-from appliance.llm.analysis import Analysis
 from appliance.model import (
     PLAIN_PRIORITY,
     ContainerInfo,
@@ -31,17 +31,20 @@ from appliance.model import (
     TaskState,
     Way,
 )
-from appliance.pool.api import Evicted, PoolDecision
-from appliance.pool.images import ImageState
-from appliance.pool.transfer.protocol import Brought
-from appliance.reasons import milliseconds
+from appliance.model.planner_api import Analysis
+from appliance.model.pool_api import Evicted, PoolDecision
+from appliance.model.task_api import ExperienceList, Line, LineKind, PlanAnswer
+from appliance.model.transfer_api import Brought
+from appliance.reasons import milliseconds, time_of_day
 from appliance.record.models import LogInfo, kinds_text, problem_of, together
-from appliance.record.player import Played
-from appliance.tasks.api import ExperienceList, PlanAnswer
-from appliance.tasks.lines import Line, LineKind
-from appliance.tasks.replay import CheckReport, ReplayReport
-from appliance.tasks.retention import done_text
-from appliance.tasks.views import waits_for
+from appliance.tasks.records import done_text
+from appliance.tasks.views import status, waits_for
+
+if TYPE_CHECKING:  # of results that are printed: commands that print no such result start without what makes them
+    from appliance.doctor import Check
+    from appliance.pool.images import ImageState
+    from appliance.record.player import Played
+    from appliance.tasks.replay import CheckReport, ReplayReport
 
 _LINE_STYLES = {
     LineKind.STATE: "",
@@ -149,7 +152,7 @@ def analysis_text(found: Analysis) -> Group:
     ]
     for each in found.able:
         last = "".join(f"; {robot} last: {why}" for robot, why in each.shunned.items())
-        lines.append(f"{each.label}: {', '.join(each.robots) or 'no robot that is known'} can do it{last}")
+        lines.append(f"{each.label}: capable: {', '.join(each.robots) or 'no known robot'}{last}")
     table = Table(box=None, pad_edge=False, header_style="bold dim")
     for name in ("image", "containers", "cpu", "memory", "volumes", "from", "for", "subtasks"):
         table.add_column(name, overflow="fold")
@@ -164,8 +167,15 @@ def analysis_text(found: Analysis) -> Group:
             f"{each.busy_s:.0f} s",
             ", ".join(each.subtasks),
         )
-    head = Text(f"expected to take {found.expected_s:.0f} s when nothing waits; containers it will need:", style="bold")
+    head = Text(f"{expected_text(found)}; containers it needs:", style="bold")
     return Group(*(Text(line) for line in lines), head, table)
+
+
+def expected_text(found: Analysis) -> str:
+    """Return how long a plan is expected to take; of skills that never ran nothing is known."""
+    if not found.unmeasured:
+        return f"expected duration: {found.expected_s:.0f} s when nothing waits"
+    return f"expected duration: not known, no run of {', '.join(found.unmeasured)} was measured yet"
 
 
 def experience_table(found: ExperienceList) -> Group:
@@ -185,8 +195,8 @@ def experience_table(found: ExperienceList) -> Group:
             row.why or "–",
         )
     moved = ", ".join(f"{tier} {value:.2f}" for tier, value in found.thresholds.items())
-    tail = Text(f"plans run unasked from: {moved or '–'}")
-    return Group(Text(f"as {found.gateway} has heard", style="bold"), table, tail)
+    tail = Text(f"plans run without approval from confidence: {moved or '–'}")
+    return Group(Text(f"source: {found.gateway}", style="bold"), table, tail)
 
 
 PIPE_WIDTH = 160
@@ -194,10 +204,17 @@ PIPE_WIDTH = 160
 
 _CONTROLS = {
     code: "\ufffd"
-    for code in (*range(0x20), *range(0x7F, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+    for code in (
+        *range(0x20),
+        *range(0x7F, 0xA0),
+        *range(0x202A, 0x202F),
+        *range(0x2066, 0x206A),
+        *range(0xD800, 0xE000),
+    )
     if chr(code) not in "\n\t"
 }
-"""Control characters and direction overrides, which a terminal obeys instead of showing them."""
+"""Control characters and direction overrides, which a terminal obeys instead of showing them; and halves of surrogate
+pairs, by which Python has bytes that are no text, and which nothing can write."""
 
 
 class SafeConsole(Console):
@@ -363,7 +380,7 @@ def task_table(record: TaskRecord) -> Group:
         ("task ", "bold"),
         record.id,
         " ",
-        (str(record.state), _TASK_STYLES.get(record.state, "yellow")),
+        (status(record), _TASK_STYLES.get(record.state, "yellow")),
         f"  coordinated by {record.coordinator}{_order_text(record)}\n{record.instruction}",
     )
     ways = [Text(f"  {each.subtask.id} {way}", style="dim") for each in record.subtasks if (way := _way_text(each))]
@@ -426,7 +443,7 @@ def task_list(records: Sequence[TaskRecord]) -> Table:
         done = sum(each.state is SubtaskState.SUCCEEDED for each in record.subtasks)
         table.add_row(
             record.id,
-            Text(str(record.state), style=_TASK_STYLES.get(record.state, "yellow")),
+            Text(status(record), style=_TASK_STYLES.get(record.state, "yellow")),
             f"{done}/{len(record.subtasks)}",
             record.coordinator,
             record.instruction,
@@ -435,11 +452,16 @@ def task_list(records: Sequence[TaskRecord]) -> Table:
     return table
 
 
-def fleet_view(gateways: Sequence[GatewayStatus]) -> Group:
-    """Gateways, a line each, and below them what is wrong with the recorders."""
+def fleet_view(gateways: Sequence[GatewayStatus], lost: Mapping[str, int] | None = None) -> Group:
+    """Gateways, a line each, and below them what is wrong with the recorders.
+
+    Args:
+        gateways: those that answer.
+        lost: those that do not, and since when, Unix nanoseconds.
+    """
     notes = together(note for each in gateways for note in each.recorders)
     lines = [Text(f"! {text}", style="yellow") for note in notes if (text := recorder_text(note))]
-    return Group(gateway_table(gateways), *lines)
+    return Group(gateway_table(gateways, lost), *lines)
 
 
 def recorder_text(note: RecorderNote) -> str:
@@ -449,8 +471,8 @@ def recorder_text(note: RecorderNote) -> str:
     return f"{name}: {problem} (hint: `swiftbot log info FILE` says when)" if problem else ""
 
 
-def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
-    """Gateways, a line each."""
+def gateway_table(gateways: Sequence[GatewayStatus], lost: Mapping[str, int] | None = None) -> Table:
+    """Gateways, a line each; `lost`: those that do not answer, and since when."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
     for name in ("gateway", "load", "memory", "containers", "runs", "tasks", "robots", "plans with", "state"):
         table.add_column(name, overflow="fold")
@@ -460,6 +482,8 @@ def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
             state += ", container limits not enforced"
         if each.site_problem:
             state += f", {each.site_problem}"
+        if each.keys_problem:
+            state += f", {each.keys_problem}"
         table.add_row(
             each.id,
             f"{each.load:.0%}",
@@ -471,6 +495,9 @@ def gateway_table(gateways: Sequence[GatewayStatus]) -> Table:
             ", ".join(each.models) or "–",
             state,
         )
+    for name, since_ns in sorted((lost or {}).items()):
+        state = Text(f"LOST since {time_of_day(since_ns)}", style="bold red")
+        table.add_row(name, *("–" for _ in range(7)), state)
     return table
 
 
@@ -513,8 +540,8 @@ def decision_table(rows: Sequence[tuple[str, PoolDecision]]) -> Table:
     return table
 
 
-def robot_table(robots: Sequence[RobotInfo]) -> Table:
-    """Robots, a line each."""
+def robot_table(robots: Sequence[RobotInfo], held: Mapping[str, str] | None = None) -> Table:
+    """Robots, a line each; `held`: by name, who has stopped a robot or taken it over."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
     for name in ("robot", "kind", "by", "has", "pose", "battery", "mode", "state"):
         table.add_column(name, overflow="fold")
@@ -522,6 +549,8 @@ def robot_table(robots: Sequence[RobotInfo]) -> Table:
         pose = f"{each.pose.x:.1f} {each.pose.y:.1f} {each.pose.z:.1f}" if each.pose else "–"
         battery = f"{each.battery_percent:.0f} %" if each.battery_percent is not None else "–"
         state = "online" if each.online else "offline"
+        if told := (held or {}).get(each.id):
+            state += f", {told}"
         if each.holding:
             state += f", holds {each.holding}"
         for words in (*each.estimator, *each.warnings):
@@ -531,7 +560,7 @@ def robot_table(robots: Sequence[RobotInfo]) -> Table:
         elif each.failsafe:
             state += f", {each.failsafe}"
         table.add_row(
-            each.id, each.kind, each.gateway or "itself", ", ".join(each.uses), pose, battery, each.mode, state
+            each.id, each.kind, each.gateway or "direct", ", ".join(each.uses), pose, battery, each.mode, state
         )
     return table
 
@@ -649,7 +678,7 @@ def check_table(checks: Sequence[Check]) -> Group:
         mark, style = ("ok", "green") if check.ok else ("FAIL", "red") if check.required else ("note", "yellow")
         lines.append(Text.assemble((f"{mark:>4}", style), f"  {check.name}: {check.detail}"))
         if not check.ok and check.remedy:
-            lines.append(Text(f"      remedy: {check.remedy}"))
+            lines.append(Text(f"      hint: {check.remedy}"))
     return Group(*lines)
 
 

@@ -270,12 +270,13 @@ async def check_images(engine: Engine, catalogue: Catalogue, config: PoolConfig)
                 ok=found,
                 detail=full if found else f"{full} is not there",
                 remedy=build_command(spec),
+                required=not spec.on_demand,
             )
         )
     return checks, usable
 
 
-async def check_container(engine: Engine, image: str, runtime: str) -> Check:
+async def check_container(engine: Engine, image: str, runtime: str, seccomp_profile: str = "") -> Check:
     """Start a container as the pool does and remove it: the only proof that runtime, ids and storage go together."""
     name = f"swiftbot-doctor-{secrets.token_hex(4)}"
     spec = ContainerSpec(
@@ -291,6 +292,7 @@ async def check_container(engine: Engine, image: str, runtime: str) -> Check:
         pids=32,
         tmp_mb=4,
         runtime=runtime,
+        seccomp_profile=seccomp_profile,
     )
     try:
         await engine.create(spec)
@@ -310,7 +312,7 @@ async def check_container(engine: Engine, image: str, runtime: str) -> Check:
 
 
 async def check_podman(make_engine: Callable[[], Engine], catalogue: Catalogue, config: PoolConfig) -> list[Check]:
-    """Ask Podman through its API socket; what cannot be told without it is told as such."""
+    """Ask Podman through its API socket; what cannot be checked without it is reported as not checked."""
     try:
         engine = make_engine()
     except SwiftbotError as error:
@@ -322,7 +324,7 @@ async def check_podman(make_engine: Callable[[], Engine], catalogue: Catalogue, 
         checks += images
         if usable:
             runtime = config.runtime or ("runc" if facts.cgroup_version == "v1" else "")
-            checks.append(await check_container(engine, usable, runtime))
+            checks.append(await check_container(engine, usable, runtime, config.seccomp_file()))
     except SwiftbotError as error:
         return _podman_silent(error)
     finally:
@@ -482,7 +484,7 @@ def check_storage(machine: Machine) -> Check:
 
 
 def check_disk(machine: Machine, folders: Sequence[Path]) -> Iterator[Check]:
-    """Yield the free space of each folder that grows; folders with the same free space are told once."""
+    """Yield the free space of each folder that grows; folders with the same free space count once."""
     told: set[int] = set()
     for folder in folders:
         free = machine.free_mb(folder)
@@ -552,6 +554,29 @@ def check_fence(name: str) -> Check:
     )
 
 
+def check_keys(plane: PlaneConfig, gateway: str, fleet: str, now: float) -> Check:
+    """The gateway's keys: whose they are, for how long they are good, and the roster beside them."""
+    if not plane.keys:
+        detail = "none: links within this machine only, on which everybody may do everything"
+        return Check(name="keys", ok=True, detail=detail, required=False)
+    # Imported here: whoever shows a check would load it too, and it takes 60 ms.
+    from appliance.identity.credentials import Credentials  # noqa: PLC0415
+
+    try:
+        credentials = Credentials.load(Path(plane.keys).expanduser(), plane.roster_file, fleet=fleet, now=now)
+        credentials.check_listener(gateway)
+    except SwiftbotError as error:
+        return Check(name="keys", ok=False, detail=error.message, remedy=error.remedy)
+    own, problem = credentials.identity, credentials.problem(now)
+    return Check(
+        name="keys",
+        ok=not problem,
+        detail=problem or f"{own.text}, good for {own.days_left(now):.0f} days; roster {credentials.roster.number}",
+        remedy=f"swiftbot keys renew {own.role} {own.name}; copy it here, and roster.json beside it",
+        required=False,
+    )
+
+
 async def check_session(open_session: Callable[[], Awaitable[Session]]) -> Check:
     """Open a Zenoh session on the loopback and have it answer itself."""
     try:
@@ -581,7 +606,7 @@ def _open_session() -> Awaitable[Session]:
 
 
 def local_checks(machine: Machine, config: GatewayConfig | None) -> list[Check]:
-    """Everything that is told without Podman or Zenoh."""
+    """All checks that need neither Podman nor Zenoh."""
     checks = [check_python(machine), check_user(machine), check_locale(machine), check_clock(machine)]
     checks += check_programs(machine)
     checks += check_ids(machine)
@@ -590,6 +615,7 @@ def local_checks(machine: Machine, config: GatewayConfig | None) -> list[Check]:
     if config is not None:
         folders += [Path(config.data_dir).expanduser(), config.record.folder]
         checks += check_ports(machine, config)
+        checks.append(check_keys(config.plane, config.id, config.fleet, machine.now()))
     checks += check_disk(machine, folders)
     checks.append(check_model(machine, config.llm.local_model if config else ""))
     checks.append(check_fence(config.site if config else "warehouse"))

@@ -16,6 +16,7 @@
     │   ├── TakenError       a pilot or a failsafe at the vehicle has it
     │   └── ContractError    its program does not answer commands, or carries one out again when it is asked again
     ├── RecordError          a log cannot be written or read
+    ├── IdentityError        a certificate, key or signature is missing, wrong, expired, revoked or of another role
     └── CancelledByOperatorError  somebody asked for it to stop
 
 `code` travels over Zenoh in an error reply and is turned back into the same class on the other side.
@@ -49,6 +50,8 @@ class Exit(IntEnum):
     """cancelled"""
     REJECTED = 8
     """its plan was rejected, or not approved in time"""
+    DENIED = 9
+    """a certificate or key is missing, wrong, expired or revoked, or its role may not do it"""
     INTERRUPTED = 130
     """interrupted"""
 
@@ -101,7 +104,7 @@ class UnreachableError(SwiftbotError):
     def __init__(self, message: str, *, remedy: str = "", retry_after_s: float = 0.0, sent: bool = False) -> None:
         super().__init__(message, remedy=remedy, retry_after_s=retry_after_s)
         self.sent = sent
-        """Whether what was asked for may have been done: it was on its way when whoever should answer went away."""
+        """Whether what was asked for may have been done: it was on its way when the addressee went away."""
 
 
 class DeadlineError(SwiftbotError):
@@ -183,7 +186,7 @@ class PreconditionError(RobotError):
 
 
 class TakenError(RobotError):
-    """A pilot or a failsafe at the vehicle has it: whoever commands it is to wait until it is given back."""
+    """A pilot or a failsafe at the vehicle has control: commands wait until it is given back."""
 
     code = "taken"
     exit_code = Exit.REFUSED
@@ -195,6 +198,13 @@ class RecordError(SwiftbotError):
     code = "record"
 
 
+class IdentityError(SwiftbotError):
+    """A certificate, key or signature is missing, wrong, expired, revoked, or of a role that may not do it."""
+
+    code = "identity"
+    exit_code = Exit.DENIED
+
+
 class CancelledByOperatorError(SwiftbotError):
     """Somebody asked for it to stop."""
 
@@ -203,7 +213,8 @@ class CancelledByOperatorError(SwiftbotError):
 
 
 def _tree(root: type[SwiftbotError]) -> dict[str, type[SwiftbotError]]:
-    found = {root.code: root}
+    # A kind without a code of its own, such as one of a room, travels as the kind that it is made from.
+    found = {root.code: root} if "code" in vars(root) else {}
     for child in root.__subclasses__():
         found |= _tree(child)
     return found

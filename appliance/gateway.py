@@ -4,7 +4,7 @@ Order: plane (others can find us) → language model → robots → pool → tas
 from the first step but accepts runs only when its pool is there. On SIGTERM: say that we drain, let runs end,
 hand over coordination (the next owner of each key goes on), leave the warm containers for the next start.
 
-State volumes and images (`StateHere`): their parts are the pool's (`pool.volumes`, `pool.transfer`); here they are
+State volumes and images (`StateHere`): their parts are the pool's (`pool.volumes`); here they are
 built, told of what others hold, and asked what this gateway says of itself; there are none without Podman.
 """
 
@@ -25,55 +25,65 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance import logs, process
+from appliance.alerts import Keeper
+from appliance.alerts.keeper import disk_mb
+from appliance.closures import keeper as closures
+from appliance.closures.keeper import Closures
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, PrerequisiteError
-from appliance.llm.api import SwapAsk, Swapped
+from appliance.learn import records as learn_records
+from appliance.learn.manager import LearnManager
 from appliance.llm.cascade import Decomposer
 from appliance.llm.checks.safety import strictest
-from appliance.llm.peers import PeerTier, ProposeAsk, Proposed
-from appliance.llm.settings import PlanContext
+from appliance.llm.peers import PeerTier
+from appliance.llm.settings import OutOfUse, PlanContext
 from appliance.model import (
     ContainerInfo,
     ContainerState,
     GatewayStatus,
     LogLine,
-    Need,
     Plan,
-    PoolHint,
     RobotInfo,
-    RunRequest,
     Site,
     VolumeInfo,
+    keyspace,
 )
+from appliance.model.planner_api import ProposeAsk, Proposed, SwapAsk, Swapped
+from appliance.model.recorder_api import RecorderStatus
+from appliance.model.task_api import ArtifactAsk, ArtifactKeep, ArtifactKept, ArtifactPiece, SiteAsk
+from appliance.plane.events import AuthorityChanged, FactsChanged, FleetEvent, Lost, Stage
 from appliance.plane.node import Plane
-from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
-from appliance.pool.engine import PodmanStorage
+from appliance.plane.records import Record
+from appliance.pool.engine import PodmanEngine
 from appliance.pool.images import reference
-from appliance.pool.pool import Call, Pool
+from appliance.pool.pool import Pool
+from appliance.pool.selection import UNMEASURED, Link
 from appliance.pool.settings import PoolConfig
-from appliance.pool.state import ALONE, State
-from appliance.pool.transfer.transfers import Transfers
-from appliance.pool.volumes import Volumes
-from appliance.process import Vitals
-from appliance.record.models import Recorders, RecorderStatus
+from appliance.pool.volumes import ALONE, State
+from appliance.pool.volumes.registry import Volumes
+from appliance.pool.volumes.transfers import Transfers
+from appliance.process import Supervisor, Vitals
+from appliance.record.models import Recorders
 from appliance.robot_tasks import RobotTasks
-from appliance.robots.api import LinkAdd, LinkRemove, LinksAsk, RobotForget
 from appliance.robots.authority.authority import SHOWN, Authority
 from appliance.robots.hub import RobotHub
 from appliance.robots.limits import Bounds, Orders, Usual
+from appliance.schedules import records as schedule_records
+from appliance.schedules.manager import ScheduleManager
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
-from appliance.tasks.api import ArtifactAsk, RunAsk, SiteAsk, TaskLinesAsk
-from appliance.tasks.artifacts import Artifacts
+from appliance.tasks.admission import refuse_commands
+from appliance.tasks.artifacts import SPARE_PLACES, ArtifactCopies, Artifacts
 from appliance.tasks.audit import Audit
+from appliance.tasks.conflicts import resolver
 from appliance.tasks.enquiries import Enquiries
-from appliance.tasks.executor import Executor
+from appliance.tasks.executor import Executor, Telling
 from appliance.tasks.handler_calls import Calls
+from appliance.tasks.handoff import Holds, Reservations, Source
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.migration.gateway import Migration
-from appliance.tasks.migration.handoff import Leaving
 from appliance.tasks.migration.policy import Load
-from appliance.tasks.offload import Links, RemoteContainers, UnmeasuredLinks
+from appliance.tasks.offload import RemoteContainers
 from appliance.tasks.retention import Retention
 from appliance.tasks.stream import Kept
 
@@ -106,8 +116,6 @@ class StateHere:
     ) -> None:
         self.state: State = ALONE
         """What the pool may do with state; nothing without Podman."""
-        self.links: Links = UnmeasuredLinks()
-        """How fast others are reached."""
         self._config = config
         self._plane = plane
         self._fleet = fleet
@@ -124,7 +132,7 @@ class StateHere:
             signed: puts an audit around the handler of an operator's verb.
         """
         try:
-            storage = PodmanStorage(self._config.podman_url)
+            storage = PodmanEngine.for_transfers(self._config.podman_url)
         except PrerequisiteError as error:
             log.warning("state volumes and images cannot be moved", reason=str(error))
             return
@@ -135,32 +143,40 @@ class StateHere:
         self._stack.push_async_callback(let_go)
         plane, settings = self._plane, self._config.transfer
         self._volumes = volumes = Volumes(
-            settings, fleet=self._fleet, gateway=plane.gateway, store=plane.store, records=plane.dht, storage=storage
-        )
+            settings, fleet=self._fleet, gateway=plane.gateway, store=plane.store, records=plane.dht, storage=storage,
+            on_change=self._on_change,
+        )  # fmt: skip
         await volumes.start()
         self._stack.push_async_callback(volumes.close)
-        volumes.on_change = self._on_change
-        plane.registry.on_change.append(self._hear_of_volumes)
-        plane.on_member_lost.append(lambda gateway: volumes.hear(gateway, ()))
+        self._stack.callback(plane.events.subscribe(Stage.VOLUMES, self._on_event))
         self._transfers = transfers = Transfers(
-            settings, plane=plane, volumes=volumes, storage=storage, data_dir=self._data
+            settings, plane=plane, volumes=volumes, storage=storage, data_dir=self._data, on_change=self._on_change
         )
         await transfers.start(signed)
         self._stack.push_async_callback(transfers.close)
-        transfers.on_change = self._on_change
         self.state = State(
             bring=transfers.bring_newest,
             use=volumes.use,
             newest_here=volumes.newest_here,
             bring_image=transfers.bring_image,
         )
-        self.links = transfers
 
-    def _hear_of_volumes(self, what: str) -> None:
-        if what == "gateway" and self._volumes is not None:
-            for gateway, status in self._plane.registry.gateways.items():
-                if gateway != self._plane.gateway:
-                    self._volumes.hear(gateway, status.volumes)
+    def link(self, gateway: str) -> Link:
+        """Return what is measured of moving state from a gateway."""
+        return self._transfers.link(gateway) if self._transfers is not None else UNMEASURED
+
+    def _on_event(self, event: FleetEvent) -> None:
+        if self._volumes is None:
+            return
+        match event:
+            case Lost(gateway):
+                self._volumes.hear(gateway, ())
+            case FactsChanged("gateway"):
+                for gateway, status in self._plane.registry.gateways.items():
+                    if gateway != self._plane.gateway:
+                        self._volumes.hear(gateway, status.volumes)
+            case _:
+                pass
 
     def volumes_mb(self, names: Iterable[str]) -> float:
         """Size of the newest states of volumes that are not here, MiB: what would have to come."""
@@ -184,6 +200,15 @@ class StateHere:
         await self._stack.aclose()
 
 
+def resolve(key: str, one: Record, other: Record) -> Record:
+    """Choose between concurrent versions of any record, by the room whose record it is."""
+    if key.startswith(keyspace.CLOSURE_RECORD.prefix):
+        return closures.resolve(one, other)
+    if schedule_records.is_ours(key):
+        return schedule_records.resolve(key, one, other)
+    return (learn_records.resolve if key.startswith(learn_records.PREFIX) else resolver)(key, one, other)
+
+
 VERSION = "0.1.0"
 SETTLE_S = 3.0
 """How long a draining gateway waits for the ends of its runs to be written: a replicated write takes milliseconds."""
@@ -197,6 +222,7 @@ class Gateway:
         self._data = Path(config.data_dir).expanduser()
         self._started_ns = time.time_ns()
         self._stack = contextlib.AsyncExitStack()
+        self.supervisor = Supervisor()
         self._vitals = Vitals()
         self._changed = asyncio.Event()
         self._draining = False
@@ -218,7 +244,9 @@ class Gateway:
         catalogue, site = self._load()
         self._site_problem = "" if site.fence is not None else f"site {site.name} has no fence"
         self._make_directories()
-        self.plane = await Plane.open(config.plane, fleet=config.fleet, gateway=config.id, data_dir=self._data)
+        self.plane = await Plane.open(
+            config.plane, fleet=config.fleet, gateway=config.id, data_dir=self._data, resolver=resolve
+        )
         self._stack.push_async_callback(self.plane.close)
         logs.publish_to(self._put_log)
         self._stack.callback(logs.publish_to, None)
@@ -226,9 +254,7 @@ class Gateway:
 
         await self._start_planner(catalogue)
 
-        recorders = self.plane.session.subscribe_typed(
-            self.plane.keys.recorder_status(), RecorderStatus, self._hear_recorder
-        )
+        recorders = self.plane.session.subscribe_typed(keyspace.RECORDER_STATUS, self._hear_recorder)
         self._stack.callback(recorders.close)
 
         audit = Audit(self.plane.session, self.plane.keys, config.id)
@@ -242,13 +268,21 @@ class Gateway:
             max_bytes=config.tasks.max_artifact_mb * 2**20,
             reserve_bytes=config.tasks.artifact_reserve_mb * 2**20,
         )
+        copies = ArtifactCopies(
+            gateway=config.id,
+            copies=config.tasks.artifact_copies,
+            places=lambda digest: self.plane.ring.successors(digest, config.tasks.artifact_copies + SPARE_PLACES),
+            ask=self._ask_to_keep,
+        )
         enquiries = Enquiries(self.plane)
         enquiries.start(audit)
         self._stack.push_async_callback(enquiries.close)
+        telling = Telling(self.plane, on_event=self._kept.hear_event)
         calls = Calls(
             self.plane,
             artifacts,
-            on_wait=self._on_wait,
+            copies=copies,
+            on_wait=telling.waits,
             hindrance=self.authority.hindrance,
             enquiries=enquiries,
             orders=orders.held,
@@ -258,13 +292,10 @@ class Gateway:
         )
         self._stack.push_async_callback(storage.close)
         await storage.open(audit.signed)
-        self._remote = remote = RemoteContainers(
-            self.plane, successors=config.plane.find_successors, links=storage.links
-        )
+        self._remote = remote = RemoteContainers(self.plane, successors=config.plane.find_successors, link=storage.link)
 
-        async def on_call(call: Call) -> dict[str, object]:
-            return await self._leaving.guard(call, calls)
-
+        # Handlers' calls go through the holds, of which the runs that leave are made once there is an executor.
+        holds = Holds()
         self.pool = Pool(
             config.pool,
             gateway=config.id,
@@ -275,56 +306,62 @@ class Gateway:
             site=site,
             find_remote=remote.find,
             facts=remote.facts,
-            on_call=on_call,
+            on_call=functools.partial(holds.guard, carry_out=calls),
             on_change=self._on_containers,
             state=storage.state,
             store=self.plane.store,
             on_decided=self._tell_decided,
         )
-        self.executor = Executor(self.plane, self.pool, remote, config.tasks)
-        self.executor.on_change = self._changed.set
-        self._leaving = Leaving(config.id, self.executor, skills=catalogue.skills, config=config.tasks.migration)
-        self.executor.telling.on_told = self._kept.hear_event
+        reservations = Reservations(config.id, self.pool)
+        self.executor = Executor(
+            self.plane, self.pool, remote, config.tasks, telling=telling, reservations=reservations,
+            on_change=self._changed.set,
+        )  # fmt: skip
         await self.executor.start()
         await self.pool.start()
         self._stack.push_async_callback(self._stop_pool)
 
         rpc = self.plane.rpc
-        rpc.register("run", RunRequest, self.executor.run)
-        rpc.register("run_status", RunAsk, self.executor.status)
-        rpc.register("run_cancel", RunAsk, self.executor.cancel)
-        rpc.register("artifact", ArtifactAsk, artifacts.piece)
+        rpc.register(keyspace.RUN, self.executor.run)
+        rpc.register(keyspace.RUN_STATUS, self.executor.status)
+        rpc.register(keyspace.RUN_CANCEL, self.executor.cancel)
+        rpc.register(keyspace.ARTIFACT, artifacts.piece)
+        rpc.register(keyspace.ARTIFACT_KEEP, functools.partial(artifacts.keep, ask=self._ask_for_piece))
 
         async def tell_site(_: SiteAsk) -> Site:
             return site
 
-        rpc.register("site", SiteAsk, tell_site)
-        rpc.register("find_containers", Need, remote.answer)
+        rpc.register(keyspace.SITE, tell_site)
+        rpc.register(keyspace.FIND_CONTAINERS, remote.answer)
         self._serve_operators(audit)
 
+        self._keep_alerts(audit)
         self.manager = TaskManager(
             config.tasks,
             plane=self.plane,
             catalogue=catalogue,
             decomposer=self.decomposer,
-            executor=self.executor,
             site=site,
             image_of=self._image_names(catalogue),
             commands=self.authority,
+            out_of_use=self._out_of_use,
             audit=audit,
+            on_change=self._changed.set,
+            on_transition=self._kept.hear_transition,
+            on_record=self._alerts.moved,
         )
-        self.manager.on_change = self._changed.set
-        self.authority.on_change.append(self.manager.look_again)
-        self.manager.recovery.on_published = self._kept.hear_transition
-        rpc.register("task_lines", TaskLinesAsk, self._kept.answer)
+        rpc.register(keyspace.TASK_LINES, self._kept.answer)
         await self.manager.start()
         self._stack.push_async_callback(self.manager.stop)
+        source = Source(config.id, self.executor, holds=holds, skills=catalogue.skills, config=config.tasks.migration)
         self.migration = Migration(
             self.plane,
             self.pool,
             executor=self.executor,
-            leaving=self._leaving,
-            tasks=self.manager,
+            source=source,
+            reservations=reservations,
+            coordinator=self.manager.coordinator,
+            manifest=self.manager.context.manifest,
             config=config.tasks.migration,
             load=self._own_load,
             volumes_mb=storage.volumes_mb,
@@ -333,28 +370,78 @@ class Gateway:
         )
         self.migration.start()
         self._stack.push_async_callback(self.migration.close)
-        self._robot_tasks.open(self.manager)
-        self._stack.callback(self._robot_tasks.close)
-        self._retention = Retention(self.plane, config.tasks)
+        self._take_tasks(audit)
+        self._retention = await self._start_learning(artifacts, audit)
         self._publish_status()
-        for work in (self._keep_publishing(), self._retention.run()):
-            self._stack.callback(asyncio.create_task(work, name=work.__qualname__).cancel)
+        root_tasks = {
+            "status": self._keep_publishing(),
+            "session": self.plane.until_gone(),
+            "retention": self._retention.run(),
+            "copies of files": copies.run(),
+        }
+        for name, work in root_tasks.items():
+            self._stack.push_async_callback(self.supervisor.start(name, work))
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
+
+    async def _start_learning(self, artifacts: Artifacts, audit: Audit) -> Retention:
+        """Take up runs of federated learning; returns what forgets old records, those of its runs excepted."""
+        manifest = self.manager.context.manifest
+        self.learn = LearnManager(
+            self.plane,
+            artifacts,
+            manifest=manifest,
+            copies=self.config.plane.replicas,
+            folder=self._learning_folder(),
+            keep_ended=self.config.tasks.keep_runs,
+            tell_decisions=self.config.tasks.tell_decisions,
+        )
+        await self.learn.start(audit)
+        self._stack.push_async_callback(self.learn.stop)
+        return Retention(self.plane, self.config.tasks, artifacts, needed=self.learn.needed)
+
+    def _take_tasks(self, audit: Audit) -> None:
+        """Take tasks from robots, and from the schedules that are this gateway's."""
+        self._robot_tasks.open(self.manager.submit, self.manager.questions)
+        self._stack.callback(self._robot_tasks.close)
+        schedules = ScheduleManager(
+            self.plane,
+            submit=audit.submission(self.manager.submit),
+            task=self.manager.questions.task,
+            check=lambda request: refuse_commands(request, self.plane.registry.robots),
+            report=self._alerts.report,
+        )
+        schedules.start(audit)
+        self._stack.push_async_callback(schedules.stop)
+
+    def _learning_folder(self) -> Path:
+        """Where this gateway's data sets and people's own models are."""
+        return Path(self.config.pool.folders.get("learning") or self._data / "folders" / "learning").expanduser()
+
+    async def _ask_to_keep(self, gateway: str, asked: ArtifactKeep) -> ArtifactKept:
+        return await self.plane.rpc.call(gateway, keyspace.ARTIFACT_KEEP, asked)
+
+    async def _ask_for_piece(self, gateway: str, asked: ArtifactAsk) -> ArtifactPiece:
+        return await self.plane.rpc.call(gateway, keyspace.ARTIFACT, asked)
 
     async def _start_robots(self, site: Site, audit: Audit, orders: Orders) -> None:
         config = self.config
-        self.authority = Authority(self.plane, orders=orders.held)
+        self.closures = closures = Closures(self.plane, site)
+        await closures.start(audit.signed)
+        self._stack.push_async_callback(closures.close)
+        self.authority = Authority(self.plane, orders=orders.held, out_of_use=closures.robot)
         await self.authority.start(audit.signed)
         self._stack.push_async_callback(self.authority.close)
-        self.authority.on_change.append(self._changed.set)
+        self.plane.on_revoked = self.authority.hold_revoked
+        self._stack.callback(self.plane.events.subscribe(Stage.WATCHERS, self._on_event))
 
         def problems(plan: Plan) -> tuple[str, ...]:
             """What would be said of a plan if it was submitted: missions are held to it when they are uploaded."""
             roster = tuple(self.plane.registry.robots.values())
             known = {robot.id for robot in roster} >= {each.robot for each in plan.subtasks if each.robot is not None}
             context = PlanContext(
-                instruction="a mission uploaded over MAVLink", robots=roster if known else None, site=site
-            )
+                instruction="a mission uploaded over MAVLink", robots=roster if known else None, site=site,
+                out_of_use=self._out_of_use(),
+            )  # fmt: skip
             return self.decomposer.review(plan, context).problems
 
         self._robot_tasks = RobotTasks(self.plane, config.safety)
@@ -372,16 +459,24 @@ class Gateway:
         await self.hub.start()
         self._stack.push_async_callback(self.hub.stop)
         rpc = self.plane.rpc
-        rpc.register("robot_links", LinksAsk, self.hub.links)
-        rpc.register("robot_link_add", LinkAdd, self.hub.add_link)
-        rpc.register("robot_link_remove", LinkRemove, self.hub.remove_link)
-        rpc.register("robot_forget", RobotForget, self.hub.forget)
+        rpc.register(keyspace.ROBOT_LINKS, self.hub.links)
+        rpc.register(keyspace.ROBOT_LINK_ADD, self.hub.add_link)
+        rpc.register(keyspace.ROBOT_LINK_REMOVE, self.hub.remove_link)
+        rpc.register(keyspace.ROBOT_FORGET, self.hub.forget)
+
+    def _out_of_use(self) -> OutOfUse:
+        return OutOfUse(places=self.closures.places, robots=self.closures.robots)
+
+    def _keep_alerts(self, audit: Audit) -> None:
+        self._alerts = Keeper(self.plane, in_maintenance=lambda: self.closures.robots)
+        self._alerts.start(audit.signed)
+        self._stack.push_async_callback(self._alerts.close)
 
     async def _start_planner(self, catalogue: Catalogue) -> None:
         config, plane = self.config, self.plane
 
         async def ask(gateway: str, asked: ProposeAsk, timeout_s: float) -> Proposed:
-            return await plane.rpc.call(gateway, "propose", asked, Proposed, timeout_s=timeout_s)
+            return await plane.rpc.call(gateway, keyspace.PROPOSE, asked, timeout_s=timeout_s)
 
         def gateways() -> dict[str, GatewayStatus]:
             members = plane.members()
@@ -396,10 +491,11 @@ class Gateway:
         await self.decomposer.start()
         self._stack.push_async_callback(self.decomposer.close)
         hearing = plane.session.subscribe(
-            plane.keys.task(), lambda message: None if message.deleted else memory.hear(message.key, message.payload)
+            plane.keys(keyspace.TASK_UPDATE),
+            lambda message: None if message.deleted else memory.hear(message.key, message.payload),
         )
         self._stack.callback(hearing.close)
-        plane.rpc.register("propose", ProposeAsk, self.decomposer.propose)
+        plane.rpc.register(keyspace.PROPOSE, self.decomposer.propose)
 
     def _image_names(self, catalogue: Catalogue) -> Callable[[str], str]:
         """Return what gives the full reference of an image; each is worked out once, from what goes into it."""
@@ -459,17 +555,21 @@ class Gateway:
 
     # --- facts about this gateway ---------------------------------------------------------------------------
 
+    def _on_event(self, event: FleetEvent) -> None:
+        if isinstance(event, AuthorityChanged):
+            self._changed.set()
+
     def _on_containers(self, containers: tuple[ContainerInfo, ...]) -> None:
         self.plane.registry.publish_containers(containers)
         self._changed.set()
 
     def _tell_decided(self, case: Struct, what: str) -> None:
-        self.plane.session.put(self.plane.keys.decided(self.config.id, what), msgspec.json.encode(case))
+        self.plane.session.put(self.plane.keys(keyspace.DECIDED, self.config.id, what), msgspec.json.encode(case))
 
     def _put_log(self, line: LogLine) -> None:
         line = line if line.source else replace(line, source=self.config.id)
         self._kept.hear_log(line)
-        self.plane.session.put(self.plane.keys.log(self.config.id), msgspec.json.encode(line))
+        self.plane.session.put(self.plane.keys(keyspace.LOG, self.config.id), msgspec.json.encode(line))
 
     def _hear_recorder(self, _key: str, status: RecorderStatus | None) -> None:
         if status is not None and self._recorders.hear(status, time.monotonic()):
@@ -478,30 +578,35 @@ class Gateway:
     def _serve_operators(self, audit: Audit) -> None:
         """Answer what operators order of this gateway's pool and model."""
         rpc, verbs = self.plane.rpc, self.pool.verbs
-        rpc.register("pool_hint", PoolHint, verbs.hint)
-        rpc.register("pool_warm", WarmAsk, audit.signed("pool_warm", verbs.warm))
-        rpc.register("pool_evict", EvictAsk, audit.signed("pool_evict", verbs.evict))
+        rpc.register(keyspace.POOL_HINT, verbs.hint)
+        rpc.register(keyspace.POOL_WARM, audit.signed("pool_warm", verbs.warm))
+        rpc.register(keyspace.POOL_EVICT, audit.signed("pool_evict", verbs.evict))
         release = audit.signed("pool_release_quarantine", verbs.release_quarantine)
-        rpc.register("pool_release_quarantine", ReleaseAsk, release)
-        rpc.register("pool_decisions", DecisionsAsk, verbs.decisions)
-        rpc.register("llm_swap", SwapAsk, audit.signed("llm_swap", self._swap_model))
+        rpc.register(keyspace.POOL_RELEASE_QUARANTINE, release)
+        rpc.register(keyspace.POOL_DECISIONS, verbs.decisions)
+        rpc.register(keyspace.LLM_SWAP, audit.signed("llm_swap", self._swap_model))
 
     async def _swap_model(self, ask: SwapAsk) -> Swapped:
         swapped = await self.decomposer.swap(ask.folder)
         self._publish_status()
         return swapped
 
-    def _on_wait(self, call: Call, note: str) -> None:
-        self.executor.waits(call, note)
-
     def status(self) -> GatewayStatus:
         """This gateway's account of itself."""
         containers = self.pool.containers()
         capacity = self.config.pool.capacity
         vitals = self._vitals.read()
+        disk_free_mb, disk_total_mb = disk_mb(self._data)
         counters = Counter[str]()
-        for each in (self.plane.session.refused, self.hub.refused, self.pool.refused, *self._storage.refused):
+        for each in (
+            self.plane.session.refused,
+            self.hub.refused,
+            self.pool.refused,
+            self.learn.refused,
+            *self._storage.refused,
+        ):
             counters.update(each)
+        credentials = self.plane.session.credentials
         return GatewayStatus(
             id=self.config.id,
             fleet=self.config.fleet,
@@ -509,6 +614,8 @@ class Gateway:
             load=min(1.0, max(vitals.cpu_percent / 100, self.executor.running / max(1, capacity))),
             cpu_percent=vitals.cpu_percent,
             memory_mb=vitals.memory_mb,
+            disk_free_mb=disk_free_mb,
+            disk_total_mb=disk_total_mb,
             capacity=capacity,
             containers=len(containers),
             ready=sum(each.state is ContainerState.READY for each in containers),
@@ -525,6 +632,7 @@ class Gateway:
             limits_enforced=self.pool.limits_enforced,
             pool_problem=self.pool.problem or self.pool.squeeze,
             site_problem=self._site_problem,
+            keys_problem=credentials.problem(time.time()) if credentials is not None else "",
             images=self._storage.images(),
             volumes=self._storage.volumes(),
             models=self.decomposer.models,
@@ -535,7 +643,7 @@ class Gateway:
             leases=self.authority.leases[:SHOWN],
             endpoints=self.config.plane.listen,
             refused=dict(counters),
-            monitor=dict(self.manager.recovery.counts),
+            monitor=dict(self.manager.findings),
             forgotten=self._retention.forgotten,
             started_ns=self._started_ns,
             pid=os.getpid(),
@@ -563,6 +671,7 @@ async def run(config: GatewayConfig) -> None:
 
     Raises:
         ConfigError: as `Gateway.start`; or another gateway of this one's id is there, and this one had to go.
+        Exception: what a root task broke with.
     """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -571,25 +680,27 @@ async def run(config: GatewayConfig) -> None:
     gateway = Gateway(config)
     await gateway.start()
     process.ready()
-    watchdog = asyncio.create_task(process.keep_alive(), name="watchdog")
+    supervisor = gateway.supervisor
+    supervisor.start("watchdog", process.keep_alive())
     stopped = asyncio.create_task(stop.wait(), name="stopped")
-    displaced = asyncio.create_task(gateway.plane.displaced(), name="displaced")
-    problem: ConfigError | None = None
+    problems = [asyncio.create_task(wait) for wait in (gateway.plane.displaced(), supervisor.crashed())]
+    problem: BaseException | None = None
     try:
-        await asyncio.wait({stopped, displaced}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({stopped, *problems}, return_when=asyncio.FIRST_COMPLETED)
         if not stop.is_set():
-            problem = displaced.result()
-            log.error("this gateway stops: its id is another's", reason=str(problem))
+            problem = next(task.result() for task in problems if task.done())
+            log.error("this gateway stops", reason=str(problem))
     finally:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.remove_signal_handler(number)
         process.stopping()
         try:
-            # Two that answer the same questions can give nothing away in good order.
+            # Two that answer the same questions can give nothing away in good order; nor can a gateway that broke.
             await gateway.stop(at_once=problem is not None)
         finally:
-            # Draining takes a while, in which the loop must go on being seen to turn.
-            for each in (watchdog, stopped, displaced):
-                each.cancel()
+            for task in (stopped, *problems):
+                task.cancel()
+            # Last: draining takes a while, in which the watchdog must go on.
+            await supervisor.close()
     if problem is not None:
         raise problem

@@ -4,6 +4,7 @@ Lines are JSON under systemd and readable text in a terminal. A gateway publishe
 `LogLine`, so the recorder has them and the terminal UI shows them.
 """
 
+import contextlib
 import itertools
 import logging
 import sys
@@ -17,13 +18,28 @@ from appliance.model import LogLine
 
 
 class _StandardError:
-    """Writes to whatever standard error is at that moment: it may be replaced after logging was set up."""
+    """Writes to whatever standard error is at that moment: it may be replaced after logging was set up.
+
+    What cannot be written (a full disk, a reader that is gone) is lost and counted, and never an error of the work that
+    it tells of: work that is done must not be answered as failed.
+    """
+
+    def __init__(self) -> None:
+        self._lost = 0
 
     def write(self, text: str) -> int:
-        return sys.stderr.write(text)
+        try:
+            if self._lost:
+                sys.stderr.write(f"{self._lost} log lines could not be written\n")
+                self._lost = 0
+            sys.stderr.write(text)
+        except (OSError, ValueError):  # ValueError: it is closed
+            self._lost += text.endswith("\n")  # a line comes in two pieces
+        return len(text)
 
     def flush(self) -> None:
-        sys.stderr.flush()
+        with contextlib.suppress(OSError, ValueError):
+            sys.stderr.flush()
 
 
 _numbers = itertools.count(1)

@@ -1,4 +1,4 @@
-"""This process as the machine sees it: systemd's notifications, the garbage collector, CPU and memory in use.
+"""This process: systemd's notifications, its root tasks (`Supervisor`), the garbage collector, CPU and memory in use.
 
 Systemd (sd_notify) hears of readiness, the watchdog, and that a daemon stops; without systemd every call does nothing,
 so daemons tell it unconditionally.
@@ -15,37 +15,52 @@ counts for half a second, and its age goes with it.
 """
 
 import asyncio
+import contextlib
 import gc
 import os
+import socket
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Awaitable, Callable, Coroutine, Generator
 from contextlib import contextmanager
-from functools import cache
 from typing import Any
 
 import psutil
-import sdnotify
+import structlog
 from msgspec import Struct
 
+log = structlog.get_logger(__name__)
 
-@cache
-def _notifier() -> Any:  # untyped library; it opens a socket, which only daemons need
-    return sdnotify.SystemdNotifier()
+
+NOTIFY_S = 1.0
+"""How long systemd may take to accept a notification."""
+
+
+def _notify(state: str) -> None:
+    """Send a line to systemd, as sd_notify(3) does; nothing without systemd, or when it does not listen."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    if address.startswith("@"):  # a name in the kernel alone
+        address = "\0" + address[1:]
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as connection:
+        connection.settimeout(NOTIFY_S)
+        connection.connect(address)
+        connection.sendall(state.encode())
 
 
 def ready() -> None:
     """The service can work."""
-    _notifier().notify("READY=1")
+    _notify("READY=1")
 
 
 def alive() -> None:
     """It still turns."""
-    _notifier().notify("WATCHDOG=1")
+    _notify("WATCHDOG=1")
 
 
 def stopping() -> None:
     """It is on its way out; the drain deadline is systemd's TimeoutStopSec."""
-    _notifier().notify("STOPPING=1")
+    _notify("STOPPING=1")
 
 
 def watchdog_s() -> float:
@@ -59,6 +74,47 @@ async def keep_alive() -> None:
     while interval_s:
         alive()
         await asyncio.sleep(interval_s)
+
+
+class Supervisor:
+    """Starts the root tasks of a daemon, each by name. One that ends by an error is logged, and ends the process."""
+
+    def __init__(self) -> None:
+        self._tasks: list[asyncio.Task[object]] = []
+        self._crash: BaseException | None = None
+        self._crashed = asyncio.Event()
+
+    def start(self, name: str, work: Coroutine[Any, Any, object]) -> Callable[[], Awaitable[None]]:
+        """Run something until it ends or is stopped; returns what stops it."""
+        task = asyncio.create_task(work, name=name)
+        self._tasks.append(task)
+        task.add_done_callback(self._ended)
+
+        async def stop() -> None:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+        return stop
+
+    def _ended(self, task: asyncio.Task[object]) -> None:
+        self._tasks.remove(task)
+        if task.cancelled() or (error := task.exception()) is None:
+            return
+        log.error("a root task broke: this process ends", task=task.get_name(), exc_info=error)
+        self._crash = self._crash or error
+        self._crashed.set()
+
+    async def crashed(self) -> BaseException:
+        """Wait until one of the tasks has ended by an error; returns that."""
+        await self._crashed.wait()
+        assert self._crash is not None  # noqa: S101 - set before the event is
+        return self._crash
+
+    async def close(self) -> None:
+        """Cancel what still runs, the last that was started first, and wait for each."""
+        for task in reversed(self._tasks.copy()):
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
 
 THRESHOLDS = (3000, 30, 20)

@@ -1,6 +1,7 @@
 """Why a task waits and why each attempt was served where it was, for people: `task why` and `pool why`, 80 columns."""
 
 from collections.abc import Iterator
+from datetime import datetime
 
 from rich.console import Group, RenderableType
 from rich.padding import Padding
@@ -8,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.model import PLAIN_PRIORITY, Choice
-from appliance.tasks.views import AttemptWhy, TaskWhy, Waits
+from appliance.model.task_api import AttemptWhy, TaskWhy, Waits
 
 
 def milliseconds(value: float | None) -> str:
@@ -18,12 +19,20 @@ def milliseconds(value: float | None) -> str:
     return f"{value:.1f} ms" if value < 1000 else f"{value / 1000:.1f} s"
 
 
+def time_of_day(at_ns: int) -> str:
+    """Return the time of day for people; dashes for none, or one that no calendar has."""
+    try:
+        return datetime.fromtimestamp(at_ns / 1e9).astimezone().strftime("%H:%M:%S") if at_ns > 0 else "--:--:--"
+    except (OverflowError, OSError, ValueError):
+        return "--:--:--"
+
+
 def why_text(found: TaskWhy) -> Group:
     """Why each attempt was served where it was: who decided, and a table of what was weighed. Fits 80 columns."""
     parts: list[RenderableType] = [
         Text.assemble(("task ", "bold"), found.id, f" {found.state}  coordinated by {found.coordinator}"),
         *_task_text(found),
-        *([Text(f"waits for: {found.waits}", style="bold yellow")] if found.waits else []),
+        *([Text(f"blocked: {found.waits}", style="bold yellow")] if found.waits else []),
         *([Text(found.done)] if found.done else []),
     ]
     for each in found.subtasks:

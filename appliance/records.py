@@ -7,13 +7,11 @@ from msgspec import Struct
 
 from appliance.connection import FleetConnection
 from appliance.errors import ConfigError, NotFoundError, SwiftbotError
-from appliance.model import VersionVector
-from appliance.plane.dht import Copy, Listed, RecordList, RecordPlace, RecordsAsk
-from appliance.plane.records import Found, KeyAsk, Record, RecordAsk, RecordChange, Written, check_key
+from appliance.model import VersionVector, keyspace
+from appliance.model.plane_api import Copy, KeyAsk, Listed, Record, RecordAsk, RecordChange, RecordPlace, RecordsAsk
+from appliance.plane.records import check_key
 
 How = Literal["owner", "replica"]
-_OURS = ("task/", "checkpoint/", "effect/", "volume/", "lease/")
-"""What gateways write themselves, and go by."""
 _WRITE_S = 8.0
 """Longer than a gateway looks for an owner: what it says of the outcome is heard."""
 
@@ -51,14 +49,14 @@ class Records(FleetConnection):
             UnreachableError: nobody who has it answers.
         """
         ask = RecordAsk(key=check_key(key), replica=how == "replica")
-        found = (await self._ask("record_read", ask, Found)).record
+        found = (await self._ask(keyspace.RECORD_READ, ask)).record
         if found is None or found.deleted:
             raise NotFoundError(f"there is no record {key}", remedy="see `swiftbot plane ls`")
         return found
 
     async def place(self, key: str) -> RecordPlace:
         """Where a record belongs, and what each replica holds of it."""
-        return await self._ask("record_place", KeyAsk(check_key(key)), RecordPlace)
+        return await self._ask(keyspace.RECORD_PLACE, KeyAsk(check_key(key)))
 
     async def write(
         self, key: str, value: bytes, *, expected: VersionVector | None, force: bool = False
@@ -73,17 +71,17 @@ class Records(FleetConnection):
         """
         self._check(key, force=force)
         change = RecordChange(key=key, value=value, expected=expected, write=uuid.uuid4().hex)
-        return (await self._ask("record_write", change, Written, timeout_s=_WRITE_S)).version
+        return (await self._ask(keyspace.RECORD_WRITE, change, timeout_s=_WRITE_S)).version
 
     async def remove(self, key: str, *, expected: VersionVector, force: bool = False) -> VersionVector:
         """Remove a record of that version; as `write`."""
         self._check(key, force=force)
         change = RecordChange(key=key, deleted=True, expected=expected, write=uuid.uuid4().hex)
-        return (await self._ask("record_write", change, Written, timeout_s=_WRITE_S)).version
+        return (await self._ask(keyspace.RECORD_WRITE, change, timeout_s=_WRITE_S)).version
 
     @staticmethod
     def _check(key: str, *, force: bool) -> None:
-        if check_key(key).startswith(_OURS) and not force:
+        if keyspace.record_kind(check_key(key)) is not None and not force:
             raise ConfigError(
                 f"{key} is written by the gateways themselves", remedy="--force, if you know what goes by it"
             )
@@ -94,7 +92,7 @@ class Records(FleetConnection):
         A removed record is listed while it is remembered.
         """
         await self.gateway()
-        found, failed = await self._each("", "records", RecordsAsk(prefix=prefix, limit=limit), RecordList)
+        found, failed = await self._each("", keyspace.RECORDS, RecordsAsk(prefix=prefix, limit=limit))
         by_key: dict[str, dict[str, Listed]] = {}
         # Where one gateway's answer was cut, others' may go on: beyond it not all copies are known.
         cuts = [each.records[-1].key for each in found.values() if each.more and each.records]

@@ -1,27 +1,37 @@
 """Tasks that robots ask this gateway for: whose they are, which are refused, and that each is done once.
 
 A robot asks on its own key, by a message or by a query, or over a MAVLink link. Whatever it says of who it is, a task
-on its key is its own. What comes before the task manager is there waits for it, or is told to ask again.
+on its key is its own. What comes before the task manager is there waits for it, or is refused for now.
 """
 
 import asyncio
+from collections.abc import Awaitable, Callable
+from typing import NamedTuple
 
 import msgspec
 import structlog
 
+from appliance.background import Background
 from appliance.errors import RefusedError, SwiftbotError
 from appliance.llm.settings import SafetyConfig
 from appliance.model import TaskRecord, TaskRequest
+from appliance.model.task_api import CancelTaskAsk, TaskAsk
 from appliance.plane.node import Plane
 from appliance.robots.task_listener import Tasks
-from appliance.tasks.api import CancelTaskAsk, TaskAsk
-from appliance.tasks.manager import TaskManager
+from appliance.tasks.endpoints import Questions
 from appliance.tasks.records import clean
 
 log = structlog.get_logger(__name__)
 
 MOST_HANDED_IN = 64
 """Tasks of robots on their way at once; a robot that asks faster is refused, and counted."""
+
+
+class _Desk(NamedTuple):
+    """Where tasks are handed in and asked after."""
+
+    submit: Callable[[TaskRequest], Awaitable[TaskRecord]]
+    questions: Questions
 
 
 class RobotTasks:
@@ -31,23 +41,27 @@ class RobotTasks:
         self.draining = False
         self._plane = plane
         self._safety = safety
-        self._manager: TaskManager | None = None
+        self._desk: _Desk | None = None
         self._opened = asyncio.Event()
-        self._handing_in: set[asyncio.Task[None]] = set()
+        self._handing_in = Background()
 
     def doors(self) -> Tasks:
         """What robots may ask of the fleet's tasks."""
         return Tasks(submit=self.submit, cancel=self.cancel, look=self.look, submit_of=self.submit_of)
 
-    def open(self, manager: TaskManager) -> None:
-        """Hand in what waits, and what comes."""
-        self._manager = manager
+    def open(self, submit: Callable[[TaskRequest], Awaitable[TaskRecord]], questions: Questions) -> None:
+        """Hand in what waits, and what comes.
+
+        Args:
+            submit: takes a task; durable when it returns.
+            questions: answers for the fleet's tasks.
+        """
+        self._desk = _Desk(submit, questions)
         self._opened.set()
 
     def close(self) -> None:
         """Give up what is on its way."""
-        for handing_in in self._handing_in:
-            handing_in.cancel()
+        self._handing_in.cancel()
 
     # --- messages ---------------------------------------------------------------------------------------------
 
@@ -55,12 +69,10 @@ class RobotTasks:
         """A robot wants something: the gateway that owns the robot's key hands it in, so that it is done once."""
         if not self._plane.dht.owns(f"robot/{robot}"):
             return
-        if len(self._handing_in) >= MOST_HANDED_IN:
+        if self._handing_in.count >= MOST_HANDED_IN:
             self._refuse(robot, f"{MOST_HANDED_IN} tasks of robots are being handed in")
             return
-        handing_in = asyncio.create_task(self.hand_in(robot, request), name=f"task of {robot}")
-        self._handing_in.add(handing_in)
-        handing_in.add_done_callback(self._handing_in.discard)
+        self._handing_in.start(self.hand_in(robot, request), f"task of {robot}")
 
     async def hand_in(self, robot: str, request: TaskRequest) -> None:
         """Hand in what a robot put on its key; nobody waits for an answer."""
@@ -70,7 +82,7 @@ class RobotTasks:
             await self._submit_own(robot, request)
         except SwiftbotError as error:
             self._refuse(robot, str(error))
-        except Exception as error:  # the boundary to what a robot sent: it is told in the log, and counted
+        except Exception as error:  # the boundary to what a robot sent: logged, and counted
             log.exception("a robot's task broke", robot=robot)
             self._refuse(robot, f"{type(error).__name__}: {error}")
 
@@ -90,19 +102,19 @@ class RobotTasks:
         return await self._ready().submit(request)
 
     async def cancel(self, task: str, by: str) -> TaskRecord:
-        """Stop a task, as whoever spoke on a link wants; a robot whose tasks may do less stops its own alone."""
-        manager = self._ready()
+        """Stop a task for a speaker on a link; a robot whose tasks may do less stops its own alone."""
+        questions = self._ready().questions
         if self._safety.robot_tasks != "any" and by in self._plane.registry.robots:
-            record = await manager.task(TaskAsk(id=task))
+            record = await questions.task(TaskAsk(id=task))
             if record.submitter != by:
                 raise RefusedError(
                     f"{task} is not a task of {by} (safety.robot_tasks)", remedy="an operator can stop it"
                 )
-        return await manager.cancel(CancelTaskAsk(id=task, by=by))
+        return await questions.cancel(CancelTaskAsk(id=task, by=by))
 
     async def look(self, task: str) -> TaskRecord:
         """How a task stands."""
-        return await self._ready().task(TaskAsk(id=task))
+        return await self._ready().questions.task(TaskAsk(id=task))
 
     # --- both -------------------------------------------------------------------------------------------------
 
@@ -110,7 +122,7 @@ class RobotTasks:
         """Hand in a task as the robot's on whose key it came, whomever it names."""
         if self._safety.robot_tasks != "any" or (request.plan is not None and self._safety.confirm_skills):
             self._check_known(robot)
-        return await self._opened_manager().submit(msgspec.structs.replace(request, submitter=robot))
+        return await self._opened_desk().submit(msgspec.structs.replace(request, submitter=robot))
 
     def _check_known(self, robot: str) -> None:
         """Refuse a task on the key of a robot that nobody knows: it would count as an operator's."""
@@ -120,12 +132,12 @@ class RobotTasks:
                 remedy="put its state on its key first",
             )
 
-    def _ready(self) -> TaskManager:
+    def _ready(self) -> _Desk:
         if self.draining:
             raise RefusedError(f"{self._plane.gateway} is draining")
-        return self._opened_manager()
+        return self._opened_desk()
 
-    def _opened_manager(self) -> TaskManager:
-        if self._manager is None:
+    def _opened_desk(self) -> _Desk:
+        if self._desk is None:
             raise RefusedError(f"{self._plane.gateway} is starting")
-        return self._manager
+        return self._desk

@@ -18,6 +18,8 @@ if [ "$(id -u)" -eq 0 ]; then
   TOOLS=$BASE/tools
   RAY=$BASE/ray
   TRAIN=$BASE/train
+  FLOWER=$BASE/flower
+  DOCS=$BASE/docs
   TREE=$BASE/work/swiftbot
   STATE=$BASE/setup
 else
@@ -29,6 +31,8 @@ else
   TOOLS=$BASE/.tools
   RAY=$BASE/.ray
   TRAIN=$BASE/.train
+  FLOWER=$BASE/.flower
+  DOCS=$BASE/.docs
   TREE=$PROJECT
   STATE=$BASE/.setup
 fi

@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from appliance import model  # noqa: E402 - a script finds the project beside itself
+from appliance.cli.printed import PRINTED  # noqa: E402
 
 FOLDER = ROOT / "docs" / "schemas"
 
@@ -41,19 +42,37 @@ def schemas() -> dict[str, str]:
     return made
 
 
-def main() -> None:
-    """Write what changed, remove what is no struct any more."""
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    wanted = schemas()
+def printed() -> dict[str, str]:
+    """Return file name -> text of the schema of what each command prints with `--json`."""
+    made: dict[str, str] = {}
+    for command, kind in sorted(PRINTED.items()):
+        schema = {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "title": f"swiftbot {command} --json",
+            **msgspec.json.schema(kind),
+        }
+        made[f"{command.replace(' ', '-')}.json"] = json.dumps(schema, indent=1, sort_keys=True) + "\n"
+    return made
+
+
+def write(folder: Path, wanted: dict[str, str]) -> None:
+    """Write what changed, remove what is no schema any more."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name, text in wanted.items():
-        file = FOLDER / name
+        file = folder / name
         if not file.is_file() or file.read_text(encoding="utf-8") != text:
             file.write_text(text, encoding="utf-8")
             print(f"wrote {file.relative_to(ROOT)}")
-    for file in FOLDER.glob("*.json"):
+    for file in folder.glob("*.json"):
         if file.name not in wanted:
             file.unlink()
             print(f"removed {file.relative_to(ROOT)}")
+
+
+def main() -> None:
+    """Write both kinds."""
+    write(FOLDER, schemas())
+    write(FOLDER / "commands", printed())
 
 
 if __name__ == "__main__":

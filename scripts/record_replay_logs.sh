@@ -1,5 +1,5 @@
 #!/bin/bash
-# Records the logs that tests/replay replays, anew: real runs of local fleets, without what nobody there looks at.
+# Records the logs that tests/replay replays: real runs of local fleets, without what nobody there looks at.
 #
 #     scripts/as_user.sh scripts/record_replay_logs.sh FOLDER [NAME...]
 #
@@ -29,7 +29,7 @@ for name in "${names[@]}"; do
   partition) chaos partition --faults partition --fault-s 10 --rest-s 5 --tasks 8 --gateways 4 --seed 13 ;;
   overload-migration)
     # A gateway whose pool is short of memory gives its runs away.
-    python -m pytest -p no:cacheprovider -q tests/integration/test_migration.py -k short_of_memory \
+    python -m pytest -p no:cacheprovider -q tests/integration/tasks/test_migration.py -k short_of_memory \
       --basetemp "$work/$name.test" -o tmp_path_retention_policy=all >&2
     mkdir -p "$work/$name"
     cp -r "$(find "$work/$name.test" -type d -name record | head -n 1)" "$work/$name/record"

@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
 # Makes this machine able to run the appliance, from nothing but git, make and Python 3.11 on Debian.
 #
-#   scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-ray] [--with-train]
+#   scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-ray] [--with-flower] [--with-train] [--with-docs]
 #
 # gateway: what a gateway and the demo need. dev: that, and the tools of `make test`. host: only the machine's part
 # (packages, user, ranges, Podman), for `make install`, which puts the program elsewhere. --with-browser: also Chromium
 # (300 MB), for the test of the terminal UI in a browser; where it cannot be had, that test says so. --with-ray: Ray, which
-# benchmarks compare with; --with-train: also PyTorch, for `swiftbot train`; each in an environment of its own.
+# benchmarks compare with; --with-flower: Flower, likewise (5 GB); --with-train: also PyTorch, for `swiftbot train`;
+# --with-docs: MkDocs; each in an environment of its own.
 # As root it sets up the service user and works for it; as a user it works in place and asks sudo for system packages
 # and id ranges only. What is there already is kept: a second run takes about a second. docs/operations.md tells more.
 set -euo pipefail
@@ -18,16 +19,20 @@ MODE=gateway
 IMAGES=1
 WITH_BROWSER=
 WITH_RAY=
+WITH_FLOWER=
 WITH_TRAIN=
+WITH_DOCS=
 for argument in "$@"; do
   case $argument in
     gateway | dev | host) MODE=$argument ;;
     --without-images) IMAGES= ;;
     --with-browser) WITH_BROWSER=1 ;;
     --with-ray) WITH_RAY=1 ;;
+    --with-flower) WITH_FLOWER=1 ;;
     --with-train) WITH_TRAIN=1 ;;
+    --with-docs) WITH_DOCS=1 ;;
     *)
-      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-ray] [--with-train])" >&2
+      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-ray] [--with-flower] [--with-train] [--with-docs])" >&2
       exit 2
       ;;
   esac
@@ -36,6 +41,10 @@ done
 PACKAGES=(podman runc crun uidmap slirp4netns fuse-overlayfs catatonit dbus-user-session mmdebstrap
   python3 python3-venv rsync ca-certificates)
 [ "$MODE" = dev ] && PACKAGES+=(systemd iproute2 tmux)  # iproute2: tests in network namespaces; tmux: the terminal UI in one
+# Gateways and recorders go by their clocks. What keeps them already is left alone, but for systemd-timesyncd, which chrony
+# replaces: it follows a clock that drifts, and tells how far off it is.
+keeps_time() { dpkg-query -W -f='${db:Status-Status}\n' chrony ntpsec ntp openntpd 2>/dev/null | grep -qx installed; }
+if [ "$MODE" = host ] && ! keeps_time; then PACKAGES+=(chrony); fi
 API_STALE=
 RANGE=65536           # ids that a rootless container may use
 NEED_FRESH_MB=4000    # environment, its downloads, images: measured 2.6 GB, and room to work
@@ -318,9 +327,12 @@ make_environment() {
   fi
 }
 
-# Ray is for measurements alone, and larger than most of the rest: the product's own environment stays without it.
+# Ray and Flower are for measurements alone, and larger than most of the rest: the product's own environment stays
+# without them.
 make_ray() { make_apart ray "$RAY" locks/bench.txt bin/ray; }
+make_flower() { make_apart flower "$FLOWER" locks/flower.txt bin/flower-superlink; }
 make_train() { make_apart train "$TRAIN" locks/train.txt bin/torchrun; }
+make_docs() { make_apart docs "$DOCS" locks/docs.txt bin/mkdocs; }
 
 # make_apart NAME FOLDER LOCK PROOF: an environment beside the program's own; PROOF is a file that it has when it is whole.
 make_apart() {
@@ -397,7 +409,7 @@ start_api() {
   (cd / && as_user podman info) >"$LOG" 2>&1 || mend_podman || fail "podman does not work for user $RUN_USER" "$(podman_remedy)"
   if systemd_runs && [ -S "$RUNTIME_DIR/systemd/private" ]; then
     (cd / && quiet "podman.socket" "look at: journalctl --user -u podman.socket" as_user systemctl --user enable --now podman.socket) || exit 1
-    # A socket file that lost its listener is made anew; a service ends by itself and starts with the next request.
+    # A socket file that lost its listener is made again; a service ends by itself and starts with the next request.
     { [ -z "$API_STALE" ] && api_answers; } || (cd / && quiet "podman.socket" "look at: journalctl --user -u podman.socket" as_user systemctl --user restart podman.socket podman.service) || exit 1
   else
     pid=$(cat "$pidfile" 2>/dev/null || true)
@@ -465,6 +477,8 @@ else
   start_api
   if [ -n "$IMAGES" ]; then build_images; fi
   if [ -n "$WITH_RAY" ]; then make_ray; fi
+  if [ -n "$WITH_FLOWER" ]; then make_flower; fi
   if [ -n "$WITH_TRAIN" ]; then make_train; fi
+  if [ -n "$WITH_DOCS" ]; then make_docs; fi
 fi
 say "ready ($MODE, user $RUN_USER)"

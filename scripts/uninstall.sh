@@ -6,7 +6,8 @@ set -euo pipefail
 
 DESTDIR=${DESTDIR:-}
 LIB=$DESTDIR/usr/local/lib
-UNITS=(swiftbot-gateway.service swiftbot-recorder.service swiftbot-router.service swiftbot-foxglove.service)
+UNITS=(swiftbot-gateway.service swiftbot-recorder.service swiftbot-router.service swiftbot-foxglove.service
+  swiftbot-upgrade.service run-swiftbot.mount)
 
 say() { echo "[uninstall] $*"; }
 
@@ -35,11 +36,12 @@ if [ -z "$DESTDIR" ] && locate_runtime_dir && [ -d "$RUNTIME_DIR" ] && command -
 fi
 
 say "units and program"
+# Links into the release that runs, and the files that installations before releases have left there.
 for unit in "${UNITS[@]}"; do rm -f "$LIB/systemd/system/$unit"; done
 rm -f "$LIB/systemd/system-generators/swiftbot-generator" "$LIB/sysusers.d/swiftbot.conf" "$LIB/tmpfiles.d/swiftbot.conf"
-if [ "$(readlink "$DESTDIR/usr/local/bin/swiftbot" 2>/dev/null)" = /opt/swiftbot/venv/bin/swiftbot ]; then
-  rm -f "$DESTDIR/usr/local/bin/swiftbot"
-fi
+for place in "$LIB"/systemd/system "$LIB"/systemd/system-generators "$LIB"/sysusers.d "$LIB"/tmpfiles.d "$DESTDIR"/usr/local/bin; do
+  if [ -d "$place" ]; then find "$place" -maxdepth 1 -type l -lname '*opt/swiftbot/*' -delete; fi
+done
 rm -rf "$DESTDIR/opt/swiftbot"
 if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then systemctl daemon-reload; fi
 

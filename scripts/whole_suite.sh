@@ -1,12 +1,16 @@
 #!/usr/bin/env bash
-# Runs the whole test suite, then those that failed once more by themselves, and says which they were.
+# whole_suite.sh [-m MARKS] PATH...: runs tests, then those of real processes that failed once more by themselves.
 #
-# Thousands of tests with real containers, radios and deadlines share two cores with whatever else the machine does, and
-# one of them that was late once would hide what all the others have shown. The second run is short, and has the machine
-# for itself; a test that fails in it as well fails the suite. Properties are tried with the same examples in both runs,
-# so that a counterexample that was found by chance is not lost by chance.
+# Tests of fleets, with real containers, links and deadlines, share two cores with whatever else the machine does, and
+# one of them that was late once would hide what all the others have shown. They (marked `fleet`) get a second run, which
+# is short and has the machine for itself; a test that fails in it as well fails the suite, and so does any other test
+# that failed. Properties are tried with the same examples in both runs, so that a counterexample that was found by chance
+# is not lost by chance. Tests outside tests/integration run in two processes, those in it one after another; of these the
+# slowest are listed.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
+marks=()
+[ "${1:-}" != -m ] || { marks=(-m "$2") && shift 2; }
 
 run() { "$here/as_user.sh" "$@"; }
 memory=$(run mktemp -d --tmpdir swiftbot-suite.XXXXXX) # of which tests failed
@@ -14,16 +18,33 @@ trap 'run rm -rf "$memory"' EXIT
 suite() { run "${PYTHON:-python}" -m pytest -o "cache_dir=$memory" "--hypothesis-seed=$seed" "$@"; }
 
 seed=$RANDOM
-status=0
-suite "$@" || status=$?
-# 1: tests failed; anything else is a run that did not come to its end.
-[ "$status" = 1 ] || exit "$status"
+apart=() together=()
+for path in "$@"; do
+    case $path in *integration*) apart+=("$path") ;; *) together+=("$path") ;; esac
+done
+failed=0
+first() {
+    local status=0
+    suite ${marks[@]+"${marks[@]}"} "$@" || status=$?
+    # 1: tests failed; 5: none is marked so; anything else is a run that did not come to its end.
+    case $status in 0 | 5) ;; 1) failed=1 ;; *) exit "$status" ;; esac
+}
+[ ${#together[@]} = 0 ] || first --numprocesses 2 --dist worksteal "${together[@]}"
+[ ${#apart[@]} = 0 ] || first --durations=40 "${apart[@]}"
+[ "$failed" = 1 ] || exit 0
 run test -e "$memory/v/cache/lastfailed" || {
     echo 'The run was ended by a test that stood still: the stacks above say where.' >&2
     exit 1
 }
-printf '\nThese failed and are run once more, by themselves:\n'
+printf '\nThese failed:\n'
 run cat "$memory/v/cache/lastfailed"
-printf '\n'
-suite --last-failed --last-failed-no-failures none "$@"
+again=(--last-failed --last-failed-no-failures none)
+status=0
+suite "${again[@]}" -m 'not fleet' --collect-only -q "$@" || status=$?
+[ "$status" = 5 ] || {
+    printf '\nThose above start no fleet: they are not run a second time.\n' >&2
+    exit 1
+}
+printf '\nThose that start a fleet are run once more, by themselves:\n'
+suite "${again[@]}" "$@"
 printf '\nAll passed, those above at the second run only: each of them is to be looked into.\n'

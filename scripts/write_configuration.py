@@ -26,10 +26,10 @@ SECTIONS = (
     ("safety", "appliance.llm.settings", "SafetyConfig"),
     ("safety.limits", "appliance.llm.settings", "RobotLimits"),
     ("robots", "appliance.robots.settings", "RobotsConfig"),
-    ("robots.mavlink", "appliance.robots.settings", "MavlinkLink"),
+    ("robots.mavlink", "appliance.model.robot_api", "MavlinkLink"),
     ("record", "appliance.record.settings", "RecordConfig"),
     ("tasks", "appliance.tasks.settings", "TasksConfig"),
-    ("tasks.detection", "appliance.tasks.durations", "DetectionConfig"),
+    ("tasks.detection", "appliance.tasks.settings", "DetectionConfig"),
     ("tasks.replan", "appliance.tasks.settings", "ReplanConfig"),
     ("tasks.migration", "appliance.tasks.settings", "MigrationConfig"),
 )
@@ -45,8 +45,9 @@ fleet = "yard"
 site = "/etc/swiftbot/site.toml"
 
 [plane]
-listen = ["tcp/0.0.0.0:7447"]
-peers = {gw-1 = "tcp/gw-1.example:7447", gw-2 = "tcp/gw-2.example:7447"}   # the same in each gateway
+listen = ["tls/0.0.0.0:7447"]
+keys = "/etc/swiftbot/keys/gateway-gw-1.pem"                                # docs/security.md
+peers = {gw-1 = "tls/gw-1.example:7447", gw-2 = "tls/gw-2.example:7447"}   # the same in each gateway
 
 [pool]
 capacity = 8
@@ -58,7 +59,8 @@ names = {"1" = "drone_1"}
 ```
 
 Commands find their fleet by `--fleet` and `--dir` (a local fleet's state file) or by `--connect`; the environment
-variables `SWIFTBOT_FLEET`, `SWIFTBOT_DIR` and `SWIFTBOT_CONNECT` say the same.
+variables `SWIFTBOT_FLEET`, `SWIFTBOT_DIR` and `SWIFTBOT_CONNECT` say the same. To gateways with keys they connect with
+those of `--keys` (`SWIFTBOT_KEYS`).
 
 ## Exit codes of `swiftbot`
 

@@ -1,6 +1,7 @@
 """Write pictures of the terminal UI's screens to docs/pictures, from a real local fleet and the log that it records.
 
-Run as the user who runs gateways, from the project's root; it takes about a minute:
+Run as the user who runs gateways, from the project's root; it takes about three minutes, and needs the image `learn`
+(`swiftbot images build learn`):
 
     scripts/as_user.sh python scripts/write_pictures.py [FOLDER]
 """
@@ -16,7 +17,9 @@ sys.path.insert(0, str(ROOT))
 
 from appliance.client import FleetClient  # noqa: E402
 from appliance.connection import FleetState  # noqa: E402
+from appliance.learn.datasets.make import Clips, make_clips  # noqa: E402
 from appliance.model import Approval, TaskRequest  # noqa: E402
+from appliance.model.learning import Clients, Emulation, Mode, Recipe, Rounds, Training  # noqa: E402
 from appliance.plane.settings import PlaneConfig  # noqa: E402
 from appliance.pool.settings import PoolConfig  # noqa: E402
 from appliance.tui.app import SwiftbotApp  # noqa: E402
@@ -38,6 +41,7 @@ SCREENS: dict[str, tuple[str, ...]] = {
     "pool": ("escape", "4"),
     "llm": ("5",),
     "learning": ("6",),
+    "run": ("enter",),
     "log": ("7",),
 }
 """Pictures in the order in which they are taken, with the keys pressed before each."""
@@ -50,9 +54,33 @@ async def settle(app: SwiftbotApp, seconds: float) -> None:
         app.draw()
 
 
+RUN = Recipe(
+    model="clips",
+    clients=Clients(partitions=6, by="site"),
+    training=Training(batch=2),
+    rounds=Rounds(count=40, target=0.9, mode=Mode.PARTIAL),
+    emulation=Emulation(nominal_batch_s=0.3, speeds={"part-001": 4.0, "part-004": 2.0}),
+)
+"""The run of federated learning that is under way, with two slow clients."""
+ROUNDS = 6
+"""Closed rounds before its pictures are taken."""
+
+
+async def trained(client: FleetClient) -> None:
+    """Start the run, and wait until some of its rounds are closed and evaluated."""
+    await client.learn_start("clips-hall", RUN)
+    async with asyncio.timeout(300):
+        while True:
+            record = (await client.learn_show("clips-hall")).run
+            if len(record.history) >= ROUNDS and record.history[-2].accuracy is not None:
+                return
+            await asyncio.sleep(0.5)
+
+
 async def of_fleet(state: FleetState, folder: Path) -> None:
     """Write a picture of each screen of a fleet that works."""
     async with FleetClient(state.endpoint) as client:
+        await trained(client)
         await client.submit(TaskRequest(instruction="rover_1: go to dock 3, photograph the red box", submitter="olga"))
         look = "rover_2: go to dock 4, photograph the shelf, then go to the gate"
         await client.submit(TaskRequest(instruction=look, submitter="olga", approval=Approval.ALWAYS))
@@ -80,7 +108,9 @@ async def of_log(state: FleetState, folder: Path) -> None:
     app = SwiftbotApp(await ReplayView.open(log), TuiConfig(logs=(str(log.parent),)))
     async with app.run_test(size=SIZE) as pilot:
         await settle(app, 1.0)
-        await pilot.press("right", "right", "space")
+        app.run_line("seek 90%")  # the run of federated learning came first
+        await settle(app, 2.0)
+        await pilot.press("space")
         await settle(app, 3.0)
         app.export_svg(folder / "tui-replay.svg")
         await pilot.press("2")
@@ -101,8 +131,9 @@ async def main() -> None:
             gateways=2,
             mavlink=1,
             zenoh=2,
-            pool=PoolConfig(floor={"base": 1, "vision": 1}),
+            pool=PoolConfig(floor={"base": 1, "vision": 1, "learn": 1}, folders={"learning": f"{directory}/data"}),
         )
+        make_clips(Path(directory) / "data" / "clips", Clips(train_sites=6, test_sites=2, train_clips=1, test_clips=2))
         state = await local_fleet.up(order, progress=print)
         try:
             await of_fleet(state, folder)

@@ -29,7 +29,7 @@ if sys.pycache_prefix:
     # What hypothesis reads out of the sources (their constants) is kept where their bytecode is: a second a process.
     configuration.set_hypothesis_home_dir(Path(sys.pycache_prefix) / "hypothesis")
 
-# Exceptions that are logged on the way are told plainly: boxes of source and locals cost a tenth of a second each.
+# Exceptions that are logged on the way are shown plainly: boxes of source and locals cost a tenth of a second each.
 structlog.configure(
     processors=[
         *structlog.get_config()["processors"][:-1],

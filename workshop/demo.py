@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.text import Text
 
 from appliance import console
-from appliance.cli.task import follow
+from appliance.cli.submit import follow
 from appliance.client import FleetClient
 from appliance.connection import FleetState
 from appliance.errors import SwiftbotError

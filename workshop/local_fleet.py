@@ -31,13 +31,15 @@ from appliance.errors import (
     SwiftbotError,
     UnreachableError,
 )
-from appliance.plane.keys import check_name
+from appliance.model.keys import check_name
+from appliance.model.robot_api import MavlinkLink
+from appliance.model.roles import Role
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
 from appliance.record.settings import RecordConfig
-from appliance.robots.settings import MavlinkLink
 from appliance.skills.catalogue import load_catalogue
+from workshop import keyring
 
 Progress = Callable[[str], None]
 
@@ -71,12 +73,19 @@ class Order(Struct, frozen=True, kw_only=True):
     pool: PoolConfig = PoolConfig()
     pools: dict[str, PoolConfig] = {}
     """Pools of single gateways, by name, instead of `pool`."""
+    secured: bool = False
+    """Whether everybody gets keys, from an authority that is made for it."""
     base: GatewayConfig | None = None
     """Configuration that the gateways' own are made from."""
 
     def pool_of(self, gateway: str) -> PoolConfig:
         """The pool of one gateway."""
         return self.pools.get(gateway, self.pool)
+
+
+def keys_folder(directory: Path) -> Path:
+    """Where the keys of a local fleet are."""
+    return directory / "keys"
 
 
 def alive(process: Process) -> bool:
@@ -99,7 +108,12 @@ async def up(order: Order, *, progress: Progress, timeout_s: float = 60.0) -> Fl
     check_name(order.fleet, "fleet")
     if not 1 <= order.gateways <= 16:
         raise ConfigError(f"{order.gateways} gateways", remedy="a local fleet has 1 to 16")
-    load_catalogue(order.skills)  # so that a mistake in a manifest is told here, and not by each gateway's log
+    if order.secured and order.zenoh:
+        raise ConfigError(
+            "simulated Zenoh robots share a world on keys that no role may use",
+            remedy="leave them out of a secured fleet",
+        )
+    load_catalogue(order.skills)  # so that a mistake in a manifest is reported here, and not in each gateway's log
     directory = order.directory
     try:
         running = [each for each in read_state(directory).processes if alive(each)]
@@ -140,11 +154,14 @@ class _Starting:
         (directory / "logs").mkdir(parents=True, exist_ok=True)
         record_dir = directory / "record"
         ports = [free_port() for _ in range(order.gateways)]
-        endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in ports)
+        endpoints = tuple(f"{'tls' if order.secured else 'tcp'}/127.0.0.1:{port}" for port in ports)
         names = tuple(f"gw-{number + 1}" for number in range(order.gateways))
         udp_ports = [free_port(socket.SOCK_DGRAM) for _ in range(order.mavlink)]
         drones = tuple(f"drone_{number + 1}" for number in range(order.mavlink))
         rovers = tuple(f"rover_{number + 1}" for number in range(order.zenoh))
+        if order.secured:
+            hosts = dict.fromkeys(names, "127.0.0.1")
+            keyring.issue(keys_folder(directory), order.fleet, gateways=hosts)
         for index, name in enumerate(names):
             links = tuple(
                 MavlinkLink(listen=f"udp://127.0.0.1:{udp_ports[drone]}", names={str(drone + 1): drones[drone]})
@@ -193,6 +210,7 @@ class _Starting:
             gateways=names,
             robots=(*drones, *rovers),
             record_dir=str(record_dir),
+            keys=self._keys(Role.ENGINEER, keyring.BENCH),
             processes=tuple(self.processes),
         )
         path = directory / "fleet.json"
@@ -223,16 +241,21 @@ class _Starting:
                 listen=(endpoints[index],),
                 peers=dict(zip(names, endpoints, strict=True)),
                 voters=names,
+                keys=self._keys(Role.GATEWAY, name),
             ),
             pool=self._order.pool_of(name),
             robots=msgspec.structs.replace(base.robots, mavlink=links),
-            record=RecordConfig(directory=str(record_dir)),
+            record=RecordConfig(directory=str(record_dir), keys=self._keys(Role.RECORDER, keyring.BENCH)),
             tasks=msgspec.structs.replace(
                 # They share this machine's processors: none is relieved by another.
                 base.tasks,
                 migration=msgspec.structs.replace(base.tasks.migration, cpu_high=0.0),
             ),
         )
+
+    def _keys(self, role: Role, name: str) -> str:
+        """File with somebody's keys; empty in a fleet without."""
+        return str(keyring.file_of(keys_folder(self._order.directory), role, name)) if self._order.secured else ""
 
     def _spawn(self, name: str, *arguments: str) -> None:
         log = self._order.directory / "logs" / f"{name}.log"
@@ -361,7 +384,7 @@ async def down(
 
 
 async def remove_containers(fleet: str, *, progress: Progress, volumes: bool = False) -> None:
-    """Remove the warm containers of a fleet, and if asked its state volumes; what cannot be removed is told."""
+    """Remove the warm containers of a fleet, and if asked its state volumes; what cannot be removed is reported."""
     await _remove(fleet, progress=progress, volumes=volumes)
 
 

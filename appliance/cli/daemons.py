@@ -1,4 +1,4 @@
-"""What runs until it is told to stop: `swiftbot gateway`, `router`, `record`, `foxglove`."""
+"""Daemons, which run until a signal ends them: `swiftbot gateway`, `router`, `record`, `foxglove`."""
 
 import asyncio
 import os
@@ -24,7 +24,7 @@ def gateway(*, config: Path) -> int:
     """Run a gateway until SIGTERM, which drains it.
 
     Args:
-        config: TOML file, see docs/configuration.md.
+        config: TOML file; see docs/configuration.md.
     """
     from appliance import config as configuration
     from appliance import gateway as daemon
@@ -40,8 +40,9 @@ def gateway(*, config: Path) -> int:
 
 def router(
     *,
-    listen: tuple[str, ...] = ("tcp/[::]:7447",),
+    listen: tuple[str, ...] = (),
     connect: tuple[str, ...] = (),
+    keys: Path | None = None,
     lease_ms: int = 1000,
     log_format: Literal["json", "text"] = "json",
 ) -> int:
@@ -51,9 +52,11 @@ def router(
     fleet and routes for all fleets.
 
     Args:
-        listen: Endpoint to accept links on; may be given several times.
-        connect: Endpoint of another router to keep linked to; may be given several times. A line or star of three to
+        listen: Endpoint to accept links on; repeatable. By default tls/[::]:7447 with --keys, and without
+            tcp/127.0.0.1:7447: links from other machines need keys.
+        connect: Endpoint of another router to keep linked to; repeatable. A line or star of three to
             five routers is enough.
+        keys: File with the keys of this router, issued for a gateway: it routes for the fleet of these keys only.
         lease_ms: A link silent for so long is dead; as the gateways have it in `plane.lease_ms`.
         log_format: json for journald and machines, text for a terminal.
     """
@@ -63,7 +66,8 @@ def router(
     logs.configure(style=log_format)
 
     async def go() -> None:
-        plane = PlaneConfig(mode="router", listen=listen, connect=connect, lease_ms=lease_ms)
+        accept = listen or (("tls/[::]:7447",) if keys else ("tcp/127.0.0.1:7447",))
+        plane = PlaneConfig(mode="router", listen=accept, connect=connect, keys=str(keys or ""), lease_ms=lease_ms)
         await run_router(plane, stop=until_signalled(), ready=lambda _: process.ready(), alive=process.alive)
 
     uvloop.run(go())
@@ -79,30 +83,29 @@ def record(*, config: Path | None = None, out: Path | None = None, where: Where 
         where: The fleet, when no configuration is given.
     """
     from appliance import config as configuration
-    from appliance.plane.settings import PlaneConfig
     from appliance.record.recorder import run_recorder
     from appliance.record.segments import about
     from appliance.record.settings import RecordConfig
     from appliance.skills.sites import load_site
 
-    told = about({}, os.environ)
+    about_log = about({}, os.environ)
     if config is not None:
         loaded = configuration.load(config)
-        told = about(msgspec.to_builtins(loaded), os.environ, site=load_site(loaded.site))
+        about_log = about(msgspec.to_builtins(loaded), os.environ, site=load_site(loaded.site))
         logs.configure(level=loaded.log_level, style=loaded.log_format)
         fleet, settings = loaded.fleet, loaded.record
-        connect = loaded.endpoints()
+        plane = loaded.dialling(settings.keys)
     else:
         endpoint = where.endpoint()
-        fleet, connect, settings = endpoint.fleet, endpoint.connect, RecordConfig(directory=str(Path.cwd()))
+        fleet, settings = endpoint.fleet, RecordConfig(directory=str(Path.cwd()))
+        plane = endpoint.plane("peer")
         logs.configure(style="text")
     if out is not None:
         settings = msgspec.structs.replace(settings, directory=str(out))
 
     async def go() -> None:
         # A peer linked to every gateway: a client hangs on one, and would miss what happens while that one is gone.
-        plane = PlaneConfig(mode="peer", connect=connect)
-        await run_recorder(settings, plane, fleet, until_signalled(), alive=_tell_systemd, about=told)
+        await run_recorder(settings, plane, fleet, until_signalled(), alive=_notify_systemd, about=about_log)
 
     uvloop.run(go())
     return 0
@@ -113,7 +116,7 @@ def foxglove(
     config: Path | None = None,
     host: str = "127.0.0.1",
     port: int = 8765,
-    keys: Annotated[tuple[str, ...], Parameter(name="--key", negative="", help="Only keys that match.")] = (),
+    keys: Annotated[tuple[str, ...], Parameter(name="--key", help="Only keys that match.")] = (),
     where: Where = HERE,
 ) -> int:
     """Show the running fleet in Foxglove: open ws://127.0.0.1:8765 there. Until SIGTERM or Ctrl-C.
@@ -122,37 +125,35 @@ def foxglove(
 
     Args:
         config: A gateway's TOML file: its fleet and endpoints, its site for the map.
-        host: Loopback only, since whoever connects sees everything.
+        host: Loopback only: anyone who connects sees everything.
         port: Port to listen on; 0: any.
         where: The fleet, when no configuration is given.
     """
     from appliance import config as configuration
-    from appliance.plane.settings import PlaneConfig
     from appliance.record.foxglove_bridge import LiveOptions, serve
     from appliance.record.segments import about
     from appliance.skills.sites import load_site
 
-    told = about({}, os.environ)
+    about_log = about({}, os.environ)
     if config is not None:
         loaded = configuration.load(config)
         logs.configure(level=loaded.log_level, style=loaded.log_format)
-        told = about(msgspec.to_builtins(loaded), os.environ, site=load_site(loaded.site))
-        fleet, connect = loaded.fleet, loaded.endpoints()
+        about_log = about(msgspec.to_builtins(loaded), os.environ, site=load_site(loaded.site))
+        fleet, plane = loaded.fleet, loaded.dialling(loaded.record.keys)
     else:
         endpoint = where.endpoint()
-        fleet, connect = endpoint.fleet, endpoint.connect
+        fleet, plane = endpoint.fleet, endpoint.plane("peer")
         logs.configure(style="text")
 
     async def go() -> None:
         options = LiveOptions(host=host, port=port, keys=keys)
-        plane = PlaneConfig(mode="peer", connect=connect)
-        await serve(options, plane, fleet, until_signalled(), about=told, told=_tell_systemd)
+        await serve(options, plane, fleet, until_signalled(), about=about_log, told=_notify_systemd)
 
     uvloop.run(go())
     return 0
 
 
-def _tell_systemd(_: object) -> None:
+def _notify_systemd(_: object) -> None:
     process.ready()
     process.alive()
 

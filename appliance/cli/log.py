@@ -1,6 +1,5 @@
 """Logs: `swiftbot log …`."""
 
-import asyncio
 import os
 import sys
 from pathlib import Path
@@ -12,7 +11,7 @@ from appliance import console
 from appliance.cli.common import HERE, TOOLS, Json, Where, show
 from appliance.errors import ConfigError, DeadlineError, Exit
 
-log_app = App(name="log", help="Look into MCAP logs, mend, replay and check them.", group=TOOLS)
+log_app = App(name="log", help="Inspect, recover, edit, replay and check MCAP logs.", group=TOOLS)
 
 
 def add_to(app: App) -> None:
@@ -21,13 +20,12 @@ def add_to(app: App) -> None:
 
 
 @log_app.command(name="info")
-def log_info(path: Path, *, verify: Annotated[bool, Parameter(negative="")] = False, as_json: Json = False) -> int:
-    """Say what an MCAP log holds, also one that was cut off.
+def log_info(path: Path, /, *, verify: bool = False, as_json: Json = False) -> int:
+    """Show what an MCAP log holds, also a truncated one.
 
     Args:
         path: The log.
         verify: Read every message, also of a finished file, so that damage in its middle is found.
-        as_json: Print JSON.
     """
     from appliance.record.reader import info
 
@@ -36,8 +34,8 @@ def log_info(path: Path, *, verify: Annotated[bool, Parameter(negative="")] = Fa
     return 0
 
 
-Keys = Annotated[tuple[str, ...], Parameter(name="--key", negative="", help="Only keys that match, such as **/task/*.")]
-Without = Annotated[tuple[str, ...], Parameter(negative="", help="Not keys that match.")]
+Keys = Annotated[tuple[str, ...], Parameter(name="--key", help="Only keys that match, such as **/task/*.")]
+Without = Annotated[tuple[str, ...], Parameter(help="Not keys that match.")]
 Since = Annotated[str, Parameter(name="--from", help="Seconds from the start, before the end (-3), or ISO 8601 time.")]
 Until = Annotated[str, Parameter(help="The same; not included.")]
 Out = Annotated[Path, Parameter(name=("--out", "-o"), help="File to write; must not exist.")]
@@ -72,19 +70,21 @@ def _copied(paths: tuple[Path, ...], out: Path, select: Any, *, as_json: bool) -
 
 
 @log_app.command(name="recover")
-def log_recover(path: Path, out: Path | None = None, *, as_json: Json = False) -> int:
-    """Make a proper file of an unfinished or damaged one; the original is left as it is.
+def log_recover(path: Path, out: Path | None = None, /, *, as_json: Json = False) -> int:
+    """Recover an unfinished or damaged log into a new file; the original is not changed.
 
     Args:
         path: The log of a recorder that was killed, or of a disk that was full or is dying.
         out: File to write; NAME.recovered.mcap beside it by default.
     """
+    if not path.name:
+        raise ConfigError(f"{str(path)!r} is no file", remedy="name the log")
     return _copied((path,), out or path.with_name(f"{path.stem}.recovered.mcap"), None, as_json=as_json)
 
 
 @log_app.command(name="merge")
-def log_merge(paths: tuple[Path, ...], *, out: Out, as_json: Json = False) -> int:
-    """Make one file of several, by time: those of one recorder after rotation, or of several recorders.
+def log_merge(paths: tuple[Path, ...], /, *, out: Out, as_json: Json = False) -> int:
+    """Merge logs by time: rotated files of one recorder, or of several recorders.
 
     Args:
         paths: The logs.
@@ -95,6 +95,7 @@ def log_merge(paths: tuple[Path, ...], *, out: Out, as_json: Json = False) -> in
 @log_app.command(name="trim")
 def log_trim(
     path: Path,
+    /,
     *,
     out: Out,
     since: Since = "",
@@ -103,7 +104,7 @@ def log_trim(
     without: Without = (),
     as_json: Json = False,
 ) -> int:
-    """Write a part of a log, by time and key, as a file of its own.
+    """Copy a part of a log, by time and key, into a new file.
 
     Args:
         path: The log.
@@ -114,13 +115,14 @@ def log_trim(
 @log_app.command(name="cat")
 def log_cat(
     paths: tuple[Path, ...],
+    /,
     *,
     since: Since = "",
     until: Until = "",
     keys: Keys = (),
     without: Without = (),
     grep: Annotated[str, Parameter(help="Only messages whose text matches this regular expression.")] = "",
-    limit: Annotated[int, Parameter(help="Stop after so many; 0: all.")] = 0,
+    limit: Annotated[int, Parameter(help="How many at most; 0: all.")] = 0,
     as_json: Json = False,
 ) -> int:
     """Print a log's messages, a line each: time, key, payload; --json prints JSON lines.
@@ -135,7 +137,7 @@ def log_cat(
         damaged = cat(paths, select, grep=grep, limit=limit, as_json=as_json, write=sys.stdout.write)
         sys.stdout.flush()
     except BrokenPipeError:
-        # Whoever read it has enough (`| head`); nothing more may be written, not even when Python ends.
+        # The reader has enough (`| head`); nothing more may be written, not even when Python ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     for problem in damaged:
@@ -144,15 +146,12 @@ def log_cat(
 
 
 @log_app.command(name="pin")
-def log_pin(
-    paths: tuple[Path, ...], *, remove: Annotated[bool, Parameter(negative="")] = False, as_json: Json = False
-) -> int:
-    """Keep logs whatever the recorder's disk budget says (an incident, say); --remove lets them go with the others.
+def log_pin(paths: tuple[Path, ...], /, *, remove: bool = False, as_json: Json = False) -> int:
+    """Pin logs: the recorder's disk budget does not delete them; --remove unpins.
 
     Args:
         paths: The logs.
         remove: Unpin them.
-        as_json: Print JSON.
     """
     from appliance.record.retention import pin
 
@@ -166,55 +165,55 @@ def log_pin(
 
 
 @log_app.command(name="check")
-def log_check(paths: tuple[Path, ...], *, as_json: Json = False) -> int:
-    """Make the decisions of logs again with this version's code and compare; 1 when one comes out differently.
+def log_check(paths: tuple[Path, ...], /, *, as_json: Json = False) -> int:
+    """Recompute the decisions of logs with this version and compare; exit code 1 when one differs.
 
-    The task state machine, the retry policy, the choice of gateways and containers, evictions: as far as what they
-    rested on is in the log. Files of one recorder are given in their order.
+    The task state machine, the retry policy, the choice of gateways and containers, evictions, rounds of federated
+    learning: as far as what they rested on is in the log. Files of one recorder are given in their order.
 
     Args:
         paths: The logs.
-        as_json: Print JSON.
     """
+    from appliance.learn.decisions import all_traced
     from appliance.tasks.replay import check
 
     _named(paths)
     with console.err.status("reading") as status:
-        report = check(paths, progress=lambda count: status.update(f"{count:,} messages"))
+        report = check(paths, traced=all_traced(), progress=lambda count: status.update(f"{count:,} messages"))
     show(report, as_json=as_json, table=console.check_summary(report))
     return Exit.DONE if report.same else Exit.FAILED
 
 
 @log_app.command(name="trigger")
-def log_trigger(reason: str, *, by: str = "", wait: float = 5.0, as_json: Json = False, where: Where = HERE) -> int:
-    """Say that what has just happened is worth keeping: recorders mark it, and those set to `incidents` write it.
+async def log_trigger(
+    reason: str, /, *, by: str = "", wait: float = 5.0, as_json: Json = False, where: Where = HERE
+) -> int:
+    """Mark an incident: recorders note it, and those set to `incidents` write it.
 
     Args:
-        reason: What happened, for whoever reads the log.
-        by: Who says so.
-        wait: Seconds to wait for a recorder to confirm it; 0: do not.
-        as_json: Print JSON.
-        where: The fleet.
+        reason: What happened.
+        by: Operator.
+        wait: Seconds to wait for a recorder to confirm it; 0: do not wait.
     """
     from appliance.record.remote_control import trigger
 
     endpoint = where.endpoint()
-    told = asyncio.run(
-        trigger(endpoint.fleet, endpoint.connect, reason, by=by or os.environ.get("USER", ""), wait_s=wait)
-    )
-    if wait and not told:
+    by = by or os.environ.get("USER", "")
+    confirmed = await trigger(endpoint.fleet, endpoint.connect, reason, by=by, wait_s=wait, keys=endpoint.keys)
+    if wait and not confirmed:
         raise DeadlineError(
             f"no recorder of {endpoint.fleet} has confirmed it within {wait:g} s",
             remedy="is one running? `swiftbot record`, or the unit swiftbot-recorder",
         )
-    lines = [f"{each.id}: {each.state}, incident {each.incidents}, file {each.file or 'none'}" for each in told]
-    show(told, as_json=as_json, table="\n".join(lines))
+    lines = [f"{each.id}: {each.state}, incident {each.incidents}, file {each.file or 'none'}" for each in confirmed]
+    show(confirmed, as_json=as_json, table="\n".join(lines))
     return 0
 
 
 @log_app.command(name="replay")
-def log_replay(
+async def log_replay(
     paths: tuple[Path, ...],
+    /,
     *,
     onto: Annotated[str, Parameter(name="--as", help="Fleet to play onto; not one at work.")] = "replay",
     rate: Annotated[float, Parameter(help="Seconds of the log a second; 0: as fast as listeners take it.")] = 1.0,
@@ -222,19 +221,15 @@ def log_replay(
     until: Until = "",
     keys: Keys = (),
     without: Without = (),
-    remap: Annotated[
-        tuple[str, ...], Parameter(negative="", help="FROM=TO: keys that begin so are played on others.")
-    ] = (),
-    loop: Annotated[bool, Parameter(negative="", help="Begin again at the end.")] = False,
-    paused: Annotated[bool, Parameter(negative="", help="Begin standing still; needs a terminal.")] = False,
-    orders: Annotated[
-        bool, Parameter(negative="", help="Play requests for tasks too: whoever listens acts on them.")
-    ] = False,
-    clock: Annotated[bool, Parameter(help="Put the log's time on recorder/replay/clock.")] = True,
-    listen: Annotated[
-        tuple[str, ...], Parameter(negative="", help="Endpoint for listeners, where no fleet is to be joined.")
-    ] = (),
-    connect: Annotated[tuple[str, ...], Parameter(negative="", help="Endpoint of a gateway or router to join.")] = (),
+    remap: Annotated[tuple[str, ...], Parameter(help="FROM=TO: keys that begin so are played on others.")] = (),
+    loop: Annotated[bool, Parameter(help="Repeat from the start at the end.")] = False,
+    paused: Annotated[bool, Parameter(help="Start paused; needs a terminal.")] = False,
+    orders: Annotated[bool, Parameter(help="Also play task requests; listeners act on them.")] = False,
+    clock: Annotated[
+        bool, Parameter(negative="--no-clock", help="Put the log's time on recorder/replay/clock.")
+    ] = True,
+    listen: Annotated[tuple[str, ...], Parameter(help="Endpoint for listeners, where no fleet is to be joined.")] = (),
+    connect: Annotated[tuple[str, ...], Parameter(help="Endpoint of a gateway or router to join.")] = (),
     as_json: Json = False,
 ) -> int:
     """Play logs onto the plane, as the fleet `replay`, so that the terminal UI, Foxglove or a program sees them again.
@@ -266,6 +261,6 @@ def log_replay(
         places = " ".join(f"--connect {each}" for each in endpoints)
         console.err.print(f"to watch: swiftbot tui --fleet {onto} {places}", markup=False)
     with console.err.status("reading") as status:
-        played = asyncio.run(replay(paths, options, fleet=onto, listen=endpoints, connect=connect, tell=status.update))
+        played = await replay(paths, options, fleet=onto, listen=endpoints, connect=connect, tell=status.update)
     show(played, as_json=as_json, table=console.played_text(played))
     return Exit.DONE if played.ended else Exit.INTERRUPTED

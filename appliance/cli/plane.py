@@ -1,6 +1,6 @@
 """Records of the plane: `swiftbot plane …`, and how records are shown."""
 
-import asyncio
+import contextlib
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,10 +10,9 @@ from cyclopts import App, Parameter
 from rich.table import Table
 
 from appliance import console
-from appliance.cli.common import HERE, TOOLS, Json, Where, show
+from appliance.cli.common import HERE, TOOLS, Json, Where, complete, show
 from appliance.errors import ConfigError, Exit, NotFoundError, PayloadError
-from appliance.plane.dht import Copy, RecordPlace
-from appliance.plane.records import Record
+from appliance.model.plane_api import Copy, Record, RecordPlace
 from appliance.records import Held
 
 
@@ -56,11 +55,11 @@ def _version(version: dict[str, int]) -> str:
     return msgspec.json.encode(version).decode() if version else ""
 
 
-plane_app = App(name="plane", help="Records of the fleet's plane: read, list, compare and set.", group=TOOLS)
+plane_app = App(name="plane", help="Read, list, write and remove records of the fleet.", group=TOOLS)
 
-Force = Annotated[bool, Parameter(negative="", help="Also what gateways write themselves, such as task/….")]
+Force = Annotated[bool, Parameter(help="Also records that only gateways write, such as task/….")]
 Expect = Annotated[
-    str, Parameter(help="The version that it must have, as JSON such as '{\"gw-1\": 3}'; by default the present one.")
+    str, Parameter(help="Expected version, as JSON such as '{\"gw-1\": 3}'; by default the current one.")
 ]
 
 
@@ -70,39 +69,34 @@ def add_to(app: App) -> None:
 
 
 @plane_app.command
-def get(
+async def get(
     key: str,
     /,
     *,
-    replica: Annotated[
-        bool, Parameter(negative="", help="From any replica: the fastest answer, which may be behind.")
-    ] = False,
-    raw: Annotated[bool, Parameter(negative="", help="Print the value alone, as it is.")] = False,
+    replica: Annotated[bool, Parameter(help="Read any replica: fastest, may be stale.")] = False,
+    raw: Annotated[bool, Parameter(help="Print only the value, as it is.")] = False,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
     """Show a record: its value and version, its owner, and what each replica holds.
 
     Args:
-        key: Of the record, such as task/t-1f3a.
+        key: Key of the record, such as task/t-1f3a.
     """
     from appliance.records import How, Records
 
     how: How = "replica" if replica else "owner"
 
-    async def go() -> tuple[Any, Any]:
-        async with Records(where.endpoint()) as records:
-            return await records.read(key, how), await records.place(key)
-
-    record, place = asyncio.run(go())
+    async with Records(where.endpoint()) as records:
+        record, place = await records.read(key, how), await records.place(key)
     if raw:
         sys.stdout.buffer.write(record.value)
         return 0
     text = _text(record.value)
     if as_json:
         value = _value(record.value)
-        told = {"key": key, "read": how, "version": record.version, "value": value, "place": place}
-        show(told | {"agree": place.agree}, as_json=True)
+        shown = {"key": key, "read": how, "version": record.version, "value": value, "place": place}
+        show(shown | {"agree": place.agree}, as_json=True)
     else:
         console.out.print(place_table(record, place, how))
         console.out.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -110,14 +104,14 @@ def get(
 
 
 @plane_app.command
-def put(
+async def put(
     key: str,
     value: str = "",
     /,
     *,
     file: Annotated[Path | None, Parameter(help="Take the value from a file.")] = None,
-    stdin: Annotated[bool, Parameter(negative="", help="Take the value from standard input.")] = False,
-    new: Annotated[bool, Parameter(negative="", help="There must be no such record yet.")] = False,
+    stdin: Annotated[bool, Parameter(help="Take the value from standard input.")] = False,
+    new: Annotated[bool, Parameter(help="Fail if the record exists.")] = False,
     expect: Expect = "",
     force: Force = False,
     as_json: Json = False,
@@ -126,7 +120,7 @@ def put(
     """Write a record, if it has not changed since it was read; prints the new version.
 
     Args:
-        key: Of the record.
+        key: Key of the record.
         value: The new value.
     """
     from appliance.records import Records
@@ -137,22 +131,18 @@ def put(
         raise ConfigError("--new and --expect exclude each other", remedy="leave one out")
     data = sys.stdin.buffer.read() if stdin else value.encode() if file is None else _read(file)
 
-    async def go() -> Any:
-        async with Records(where.endpoint()) as records:
-            expected = _read_version(expect) if expect else None
-            if not new and not expect:
-                try:
-                    expected = (await records.read(key)).version
-                except NotFoundError:
-                    expected = None
-            return await records.write(key, data, expected=expected, force=force)
-
-    _tell_version(key, asyncio.run(go()), as_json=as_json)
+    async with Records(where.endpoint()) as records:
+        expected = _read_version(expect) if expect else None
+        if not new and not expect:
+            with contextlib.suppress(NotFoundError):
+                expected = (await records.read(key)).version
+        version = await records.write(key, data, expected=expected, force=force)
+    _show_version(key, version, as_json=as_json)
     return 0
 
 
 @plane_app.command
-def rm(
+async def rm(
     key: str,
     /,
     *,
@@ -164,51 +154,46 @@ def rm(
     """Remove a record, if it has not changed since it was read.
 
     Args:
-        key: Of the record.
+        key: Key of the record.
     """
     from appliance.records import Records
 
-    async def go() -> Any:
-        async with Records(where.endpoint()) as records:
-            expected = _read_version(expect) if expect else (await records.read(key)).version
-            return await records.remove(key, expected=expected, force=force)
-
-    _tell_version(key, asyncio.run(go()), as_json=as_json)
+    async with Records(where.endpoint()) as records:
+        expected = _read_version(expect) if expect else (await records.read(key)).version
+        version = await records.remove(key, expected=expected, force=force)
+    _show_version(key, version, as_json=as_json)
     return 0
 
 
 @plane_app.command
-def ls(
+async def ls(
     prefix: str = "",
     /,
     *,
     limit: int = 200,
-    removed: Annotated[bool, Parameter(negative="", help="Also records that were removed and are remembered.")] = False,
+    removed: Annotated[bool, Parameter(help="Also removed records that are remembered.")] = False,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
     """List records by key: version, owner, who holds copies, and whether these agree.
 
     Args:
-        prefix: Only keys that begin so.
-        limit: At most so many, 1 to 1,000.
+        prefix: Beginning of the keys.
+        limit: How many at most, 1 to 1,000.
     """
-    from appliance.plane.dht import MOST_LISTED
+    from appliance.model.plane_api import MOST_LISTED
     from appliance.records import Records
 
     if not 1 <= limit <= MOST_LISTED:
         raise ConfigError(f"--limit {limit}", remedy=f"1 to {MOST_LISTED:,}")
 
-    async def go() -> tuple[Any, Any]:
-        async with Records(where.endpoint()) as records:
-            return await records.held(prefix, limit)
-
-    found, failed = asyncio.run(go())
+    async with Records(where.endpoint()) as records:
+        found, failed = await records.held(prefix, limit)
     listed = [each for each in found if removed or not each.newest.deleted]
-    told = [msgspec.to_builtins(each) | {"agree": each.agree} for each in listed]
-    show(told, as_json=as_json, table=held_table(listed))
+    rows = [complete(each) | {"agree": each.agree} for each in listed]
+    show(rows, as_json=as_json, table=held_table(listed))
     for name, error in sorted(failed.items()):
-        console.err.print(f"{name} does not answer: {error}", markup=False)
+        console.err.print(f"{name} did not answer: {error}", markup=False)
     return Exit.UNREACHABLE if failed else Exit.DONE
 
 
@@ -225,7 +210,7 @@ def _read(file: Path) -> bytes:
     try:
         return file.read_bytes()
     except OSError as error:
-        raise NotFoundError(f"{file} cannot be read: {error.strerror}", remedy="name a file that is there") from error
+        raise NotFoundError(f"{file} cannot be read: {error.strerror}", remedy="name an existing file") from error
 
 
 def _value(value: bytes) -> Any:
@@ -253,7 +238,7 @@ def _text(value: bytes) -> str:
     return "".join(each if each.isprintable() or each in "\n\t" else "\ufffd" for each in text)
 
 
-def _tell_version(key: str, version: dict[str, int], *, as_json: bool) -> None:
+def _show_version(key: str, version: dict[str, int], *, as_json: bool) -> None:
     if as_json:
         show({"key": key, "version": version}, as_json=True)
     else:

@@ -1,6 +1,5 @@
 """Robots: `swiftbot robots …`: who there is, MAVLink links, taking one over by hand, conformance of its program."""
 
-import asyncio
 import getpass
 import os
 import sys
@@ -11,22 +10,24 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
+from msgspec.structs import replace
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
 from appliance import console
-from appliance.cli.common import HERE, WORK, Json, Where, show
+from appliance.cli.common import HERE, WORK, Json, Where, Why, fields, show
+from appliance.cli.times import until_of
 from appliance.client import FleetClient
 from appliance.errors import ConfigError, ConflictError, Exit, NotFoundError, RefusedError, SwiftbotError
-from appliance.model import Lease, RobotReply, SubtaskState, TaskState
-from appliance.plane.keys import check_name
-from appliance.robots.api import LEASE_S, Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, RobotForget
-from appliance.robots.conformance import Conformance, Operator, Report, Seen, is_present
-from appliance.robots.settings import MavlinkLink
+from appliance.model import Lease, RobotInfo, SubtaskState, TaskState
+from appliance.model.keys import check_name
+from appliance.model.robot_api import LinkAdd, LinkFacts, LinkList, LinkRemove, MavlinkLink, RobotForget, Standing
+from appliance.robots.authority.soft_stop import Stops
+from appliance.robots.conformance import Conformance, Operator, Seen, is_present
 
-robots_app = App(name="robots", help="Robots: who there is, their MAVLink links, and buttons.", group=WORK)
-links_app = App(name="links", help="MAVLink links of gateways: what goes over them; add and remove them.")
+robots_app = App(name="robots", help="List robots, take them over, check them, manage MAVLink links.", group=WORK)
+links_app = App(name="links", help="List, add and remove the MAVLink links of gateways.")
 robots_app.command(links_app)
 
 
@@ -37,52 +38,109 @@ def add_to(app: App) -> None:
 
 @robots_app.default
 @robots_app.command(name="list")
-def robots_list(*, as_json: Json = False, where: Where = HERE) -> int:
-    """Show the robots."""
+async def robots_list(*, as_json: Json = False, where: Where = HERE) -> int:
+    """List the robots: whether each is online, stopped, or taken over. Exit code 1: stops are not known."""
+    unsure = ""
+    async with where.client() as client:
+        await client.gateway()
+        try:
+            standing = await client.standing()
+            closures = (await client.closures()).closures
+        except SwiftbotError as error:
+            standing, closures, unsure = None, (), error.message
+        robots = sorted(client.plane.registry.robots.values(), key=lambda each: each.id)
+    kept_out = {each.name: each.text for each in closures if each.kind == "robot"}
+    found = [replace(robot_shown(each, standing), maintenance=kept_out.get(each.id)) for each in robots]
+    held = {each.id: "; ".join(filter(None, (each.stopped, each.taken_over, each.maintenance))) for each in found}
+    if unsure:
+        held = dict.fromkeys(held, "stops not known")
+    show(found, as_json=as_json, table=console.robot_table(robots, held))
+    if unsure:
+        console.err.print(f"which robots are stopped or taken over is not known: {unsure}", markup=False)
+    return Exit.FAILED if unsure else Exit.DONE
 
-    async def go() -> None:
-        async with FleetClient(where.endpoint()) as client:
-            await client.gateway()
-            found = sorted(client.plane.registry.robots.values(), key=lambda each: each.id)
-        show(found, as_json=as_json, table=console.robot_table(found))
 
-    asyncio.run(go())
-    return 0
+class RobotShown(RobotInfo, frozen=True, kw_only=True):
+    """A robot as it describes itself, and what holds it."""
+
+    stopped: str | None = None
+    """The soft stop that holds it, in words; null: none."""
+    taken_over: str | None = None
+    """Which operator has taken it over, in words; null: nobody."""
+    maintenance: str | None = None
+    """Who has taken it out of use, why and until when, in words; null: it is in use."""
+    stops_known: bool = True
+    """False: no gateway answered what holds it, so that `stopped`, `taken_over` and `maintenance` say nothing."""
 
 
-@robots_app.command(name="forget")
-def robots_forget(robot: str, *, as_json: Json = False, where: Where = HERE) -> int:
-    """Remove the row of a robot that is offline; it comes back when it is heard again.
+def robot_shown(robot: RobotInfo, standing: Standing | None) -> RobotShown:
+    """Return a robot with what holds it; without an answer that is not known."""
+    if standing is None:
+        return RobotShown(**fields(robot), stops_known=False)
+    stops = Stops()
+    stops.merge(standing.stops, standing.lifted)
+    stop = stops.of(robot.id)
+    leases = [each.text for each in standing.leases if each.robot == robot.id and not each.ended]
+    return RobotShown(**fields(robot), stopped=stop.text if stop else None, taken_over="; ".join(leases) or None)
+
+
+@robots_app.command(name="maintain")
+async def robots_maintain(
+    robot: str,
+    /,
+    *,
+    until: Annotated[str, Parameter(help="When it ends by itself: 14:00, 2026-12-01, or a duration such as 2h.")] = "",
+    end: Annotated[bool, Parameter(help="End it: tasks may command the robot again.")] = False,
+    why: Why = "",
+    as_json: Json = False,
+    where: Where = HERE,
+) -> int:
+    """Take a robot into maintenance: no plan uses it and no task commands it; `robots takeover` still moves it.
 
     Args:
         robot: Its name as the list shows it.
     """
+    if end and until:
+        raise ConfigError("give --until or --end", remedy="leave one of them out")
+    until_ns = until_of(until)
+    async with where.client() as client:
+        if end:
+            done = await client.reopen("robot", robot, why=why)
+        else:
+            done = await client.maintain(robot, until_ns=until_ns, why=why)
+    show(
+        done,
+        as_json=as_json,
+        table=f"{robot} is in use again; it was {done.text}" if end else f"{robot} is {done.text}",
+    )
+    return Exit.DONE
 
-    async def go() -> Forgotten:
-        async with FleetClient(where.endpoint()) as client:
-            return await client.robot_forget(RobotForget(robot=robot, by=_who()))
 
-    done = asyncio.run(go())
+@robots_app.command(name="forget")
+async def robots_forget(robot: str, /, *, as_json: Json = False, where: Where = HERE) -> int:
+    """Forget a robot that is offline; it is listed again once it is heard.
+
+    Args:
+        robot: Its name as the list shows it.
+    """
+    async with where.client() as client:
+        done = await client.robot_forget(RobotForget(robot=robot, by=_who()))
     if as_json:
         show(done, as_json=True)
     else:
-        console.out.print(f"{done.gateway} has forgotten {done.robot}", markup=False)
+        console.out.print(f"{done.gateway} forgot {done.robot}", markup=False)
     return 0
 
 
-Gateway = Annotated[str, Parameter(help="The gateway; needed only where there are several.")]
+Gateway = Annotated[str, Parameter(help="Gateway ID; needed if there are several.")]
 
 
 @links_app.default
 @links_app.command(name="list")
-def robots_links(*, gateway: Gateway = "", as_json: Json = False, where: Where = HERE) -> int:
-    """Show MAVLink links: rates, senders with their losses, latency, what was refused, routes."""
-
-    async def go() -> tuple[dict[str, LinkList], dict[str, SwiftbotError]]:
-        async with FleetClient(where.endpoint()) as client:
-            return await client.robot_links(gateway)
-
-    found, failed = asyncio.run(go())
+async def robots_links(*, gateway: Gateway = "", as_json: Json = False, where: Where = HERE) -> int:
+    """List MAVLink links: rates, senders with their losses, latency, refused frames, routes."""
+    async with where.client() as client:
+        found, failed = await client.robot_links(gateway)
     show([found[name] for name in sorted(found)], as_json=as_json, table=links_tables(found))
     for name, error in sorted(failed.items()):
         console.err.print(f"{name} does not answer: {error}", markup=False)
@@ -90,32 +148,33 @@ def robots_links(*, gateway: Gateway = "", as_json: Json = False, where: Where =
 
 
 @links_app.command(name="add")
-def robots_link_add(
+async def robots_link_add(
     url: str,
+    /,
     *,
     gateway: Gateway = "",
-    connect: Annotated[bool, Parameter(negative="", help="Connect to the address instead of listening.")] = False,
+    connect: Annotated[bool, Parameter(help="Connect to the address instead of listening.")] = False,
     signing: str = "",
     only_in: tuple[str, ...] = (),
     not_in: tuple[str, ...] = (),
     only_out: tuple[str, ...] = (),
     not_out: tuple[str, ...] = (),
     prefix: str = "drone_",
-    mavlink1: Annotated[bool, Parameter(negative="")] = False,
+    mavlink1: bool = False,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
-    """Open a MAVLink link on a running gateway; it is kept over restarts.
+    """Add a MAVLink link to a running gateway; it is kept over restarts.
 
     Args:
         url: udp://host:port, tcp://host:port, or serial:/dev/ttyUSB0:57600.
         signing: File on the gateway with the link's MAVLink 2 signing key.
-        only_in: Message heard there that may go on to other links; may be given several times.
-        not_in: But not this one.
-        only_out: Message of other links that may be sent there.
-        not_out: But not this one.
-        prefix: Names of vehicles heard there: this and their system id.
-        mavlink1: Send MAVLink 1 alone, to what understands no other.
+        only_in: Message received there that may be forwarded to other links; repeatable.
+        not_in: Message that may not; repeatable.
+        only_out: Message of other links that may be sent there; repeatable.
+        not_out: Message that may not; repeatable.
+        prefix: Prefix of the names of vehicles there, before their system ID.
+        mavlink1: Send MAVLink 1 only.
     """
     serial = url.startswith("serial:")
     link = MavlinkLink(
@@ -124,12 +183,9 @@ def robots_link_add(
     )  # fmt: skip
     link.check()
 
-    async def go() -> tuple[str, LinkFacts]:
-        async with FleetClient(where.endpoint()) as client:
-            name = await _only(client, gateway)
-            return name, await client.robot_link_add(name, LinkAdd(link=link, by=_who()))
-
-    name, facts = asyncio.run(go())
+    async with where.client() as client:
+        name = await _only(client, gateway)
+        facts = await client.robot_link_add(name, LinkAdd(link=link, by=_who()))
     if as_json:
         show(facts, as_json=True)
     else:
@@ -138,19 +194,15 @@ def robots_link_add(
 
 
 @links_app.command(name="remove")
-def robots_link_remove(url: str, *, gateway: Gateway = "", as_json: Json = False, where: Where = HERE) -> int:
-    """Close a MAVLink link of a running gateway for good, also one of its configuration.
+async def robots_link_remove(url: str, /, *, gateway: Gateway = "", as_json: Json = False, where: Where = HERE) -> int:
+    """Remove a MAVLink link of a running gateway for good, also one of its configuration.
 
     Args:
         url: The link as the list shows it.
     """
-
-    async def go() -> tuple[str, LinkFacts]:
-        async with FleetClient(where.endpoint()) as client:
-            name = await _only(client, gateway)
-            return name, await client.robot_link_remove(name, LinkRemove(url=url, by=_who()))
-
-    name, facts = asyncio.run(go())
+    async with where.client() as client:
+        name = await _only(client, gateway)
+        facts = await client.robot_link_remove(name, LinkRemove(url=url, by=_who()))
     if as_json:
         show(facts, as_json=True)
     else:
@@ -170,7 +222,7 @@ async def _only(client: FleetClient, gateway: str) -> str:
     members = sorted(client.plane.members())
     if len(members) > 1:
         raise RefusedError(
-            f"there are {len(members)} gateways", remedy=f"say --gateway with one of {', '.join(members)}"
+            f"there are {len(members)} gateways", remedy=f"give --gateway with one of {', '.join(members)}"
         )
     return members[0]
 
@@ -180,8 +232,8 @@ def robots_qgc_actions(*, config: Path, out: Path | None = None) -> int:
     """Write QGroundControl's custom actions file: a button for each task template of a gateway.
 
     Args:
-        config: The gateway's TOML file, whose robots.templates are meant.
-        out: File to write, for QGroundControl's CustomActions folder; printed when not given.
+        config: The gateway's TOML file, with robots.templates.
+        out: File to write, for QGroundControl's CustomActions folder; if not given, it is printed.
     """
     from appliance import config as configuration
     from appliance.robots.qgc import actions
@@ -240,56 +292,26 @@ def _note(link: LinkFacts) -> str:
 
 STEP_S = 0.5
 
-LeaseId = Annotated[str, Parameter(name="--lease", help="Id of the lease, as `robots take` printed it.")]
-
-
-@robots_app.command(name="take")
-def robots_take(
-    robot: str,
-    *,
-    lease: Annotated[float, Parameter(help="Seconds until it ends by itself.", validator=Number(gte=1, lte=120))] = (
-        3 * LEASE_S
-    ),
-    why: str = "",
-    as_json: Json = False,
-    where: Where = HERE,
-) -> int:
-    """Take a robot over: it holds, its tasks wait, and only commands with the lease move it until that ends.
-
-    Args:
-        robot: Which robot.
-        lease: Seconds until it ends by itself.
-        why: Why, for the audit and for the tasks that wait.
-        as_json: Print JSON.
-        where: The fleet.
-    """
-
-    async def go() -> None:
-        async with FleetClient(where.endpoint()) as client:
-            found = await client.take_over(robot, lease_s=lease, why=why)
-        text = f"{robot} is yours for {found.lease_s:g} s: --lease {found.id}"
-        show(found, as_json=as_json, table=text)
-
-    asyncio.run(go())
-    return 0
+LeaseId = Annotated[str, Parameter(name="--lease", help="ID of the lease, as `robots takeover` printed it.")]
 
 
 @robots_app.command(name="renew")
-def robots_renew(robot: str, *, lease: LeaseId, as_json: Json = False, where: Where = HERE) -> int:
-    """Keep a robot that was taken over for as long again."""
+async def robots_renew(robot: str, /, *, lease: LeaseId, as_json: Json = False, where: Where = HERE) -> int:
+    """Renew the lease of a robot that was taken over.
 
-    async def go() -> None:
-        async with FleetClient(where.endpoint()) as client:
-            found = await client.renew(Lease(id=lease, robot=robot))
-        show(found, as_json=as_json, table=f"{robot} is yours for {found.lease_s:g} s more")
-
-    asyncio.run(go())
+    Args:
+        robot: Robot ID.
+    """
+    async with where.client() as client:
+        found = await client.renew(Lease(id=lease, robot=robot))
+    show(found, as_json=as_json, table=f"renewed {robot} for {found.lease_s:g} s")
     return 0
 
 
 @robots_app.command(name="move")
-def robots_move(
+async def robots_move(
     robot: str,
+    /,
     *,
     lease: LeaseId,
     forward: float = 0.0,
@@ -300,7 +322,7 @@ def robots_move(
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
-    """Move a robot that was taken over; it holds when the time is over, or this command ends.
+    """Move a robot that was taken over; it holds afterwards, or when this command ends.
 
     Args:
         robot: Which robot.
@@ -310,46 +332,36 @@ def robots_move(
         up: Up, of one that flies.
         turn: Degrees a second to the right.
         seconds: For how long.
-        as_json: Print JSON.
-        where: The fleet.
     """
     velocity = {"forward_mps": forward, "left_mps": left, "up_mps": up, "turn_dps": turn}
 
-    async def go() -> RobotReply:
-        async with FleetClient(where.endpoint()) as client:
-            held = Lease(id=lease, robot=robot)
-            until = time.monotonic() + seconds
-            while True:
-                left_s = until - time.monotonic()
-                for_s = max(0.05, min(STEP_S, left_s))
-                reply = await client.drive(held, "velocity", **velocity, for_s=for_s)
-                if left_s <= STEP_S:
-                    return reply
-                await client.renew(held)
-
-    reply = asyncio.run(go())
+    async with where.client() as client:
+        held = Lease(id=lease, robot=robot)
+        until = time.monotonic() + seconds
+        while True:
+            left_s = until - time.monotonic()
+            for_s = max(0.05, min(STEP_S, left_s))
+            reply = await client.drive(held, "velocity", **velocity, for_s=for_s)
+            if left_s <= STEP_S:
+                break
+            await client.renew(held)
     show(reply.result, as_json=as_json, table=f"{robot} is at {reply.result.get('pose')}")
     return 0
 
 
-@robots_app.command(name="give")
-def robots_give(robot: str, *, lease: LeaseId, why: str = "", as_json: Json = False, where: Where = HERE) -> int:
-    """Give a robot back to the tasks; it holds first.
+@robots_app.command(name="release")
+async def robots_release(
+    robot: str, /, *, lease: LeaseId, why: Why = "", as_json: Json = False, where: Where = HERE
+) -> int:
+    """Release a robot that was taken over: it holds, then its tasks continue.
 
     Args:
         robot: Which robot.
         lease: The lease.
-        why: Why, for the audit.
-        as_json: Print JSON.
-        where: The fleet.
     """
-
-    async def go() -> None:
-        async with FleetClient(where.endpoint()) as client:
-            found = await client.give_back(Lease(id=lease, robot=robot), why=why)
-        show(found, as_json=as_json, table=f"{robot} is {found.ended}")
-
-    asyncio.run(go())
+    async with where.client() as client:
+        found = await client.give_back(Lease(id=lease, robot=robot), why=why)
+    show(found, as_json=as_json, table=f"{robot} is {found.ended}")
     return 0
 
 
@@ -361,14 +373,15 @@ _MARKS = {"passed": "[green]✔[/green]", "failed": "[red]✘[/red]", "skipped":
 
 
 @robots_app.command(name="check")
-def robots_check(
+async def robots_check(
     robot: str,
+    /,
     *,
-    moves: Annotated[bool, Parameter(negative="", help="Drive the robot a metre and back, too.")] = False,
+    moves: Annotated[bool, Parameter(help="Also drive the robot a metre and back.")] = False,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
-    """Check that the program of a robot that speaks Zenoh keeps to the contract (docs/robot-contract.md).
+    """Check that the program of a Zenoh robot conforms to the contract (docs/robot-contract.md).
 
     The robot does not move, unless --moves is given; it holds for about half a minute, under a lease, so that no task
     commands it. Ends with exit code 1 when a check fails.
@@ -386,21 +399,18 @@ def robots_check(
     def seen(one: Seen) -> None:
         console_of.print(f"{_MARKS[one.outcome]} {one.check}: {escape(one.what)}", markup=True, highlight=False)
         if one.remedy:
-            console_of.print(f"  remedy: {one.remedy}", markup=False, highlight=False)
+            console_of.print(f"  hint: {one.remedy}", markup=False, highlight=False)
 
-    async def go() -> Report:
-        async with FleetClient(where.endpoint()) as client:
-            await client.gateway()
-            await _may_be_checked(client, robot)
-            checks = Conformance(client.plane.session, robot, _operator(client, robot), on_begin=begin, on_seen=seen)
-            return await checks.run(moves=moves)
-
-    report = asyncio.run(go())
+    async with where.client() as client:
+        await client.gateway()
+        await _may_be_checked(client, robot)
+        checks = Conformance(client.plane.session, robot, _operator(client, robot), on_begin=begin, on_seen=seen)
+        report = await checks.run(moves=moves)
     if as_json:
         show(report, as_json=True)
     else:
         failed = sum(each.outcome == "failed" for each in report.checks)
-        verdict = "keeps to the contract" if report.passed else f"fails {failed} of {len(report.checks)} checks"
+        verdict = "conforms to the contract" if report.passed else f"fails {failed} of {len(report.checks)} checks"
         console.out.print(f"{robot} {verdict}", markup=False, highlight=False)
     return Exit.DONE if report.passed else Exit.FAILED
 

@@ -1,7 +1,10 @@
 """Instruction to validated plan: the cascade of tiers and what belongs to each.
 
-Doors: `settings` (configuration, `PlanContext`, `PlanOutcome`), `cascade.Decomposer`, `checks.schema.validate`,
-`review.review`. Way of an instruction: `preprocessing` -> `plan_cache` -> `tiers` in order, as `routing` allows ->
+Doors: `cascade.Decomposer` with `peers.PeerTier`; `settings`; `stop_words` with `preprocessing.stop_refused`;
+`training_words` with `preprocessing.training_refused`; `checks.schema` (whether a plan can be run at all),
+`checks.safety.strictest` and `checks.safety.out_of_use`; `batch` (many instructions of a file).
+
+Way of an instruction: `preprocessing` -> `plan_cache` -> `tiers` in order, as `routing` allows ->
 `completion` -> `review` by `checks`; `feedback` keeps what became of the plans. Tiers keep the contract in `tier`:
 `local` with `worker` and `decoder` (the model's process) over the plan `language`, `peers`, `upstream`, and `rules`.
 

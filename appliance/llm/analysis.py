@@ -10,11 +10,10 @@ next begin, and how much memory.
 import re
 from collections.abc import Callable, Mapping, Sequence
 
-from msgspec import Struct
-
 from appliance.llm.checks.schema import able
 from appliance.llm.values import quantity, unit_of
 from appliance.model import Plan, RobotInfo, Subtask
+from appliance.model.planner_api import Able, Allocation, Analysis, Constraint, Parameter
 from appliance.skills.catalogue import Catalogue, SkillManifest
 
 DATASETS = (
@@ -58,16 +57,6 @@ _PATTERNS = (
 _ORDER = ("deadline", "clock", "window", "period", "duration", "distance", "speed", "altitude", "dataset")
 
 
-class Constraint(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One of them. `value` in `unit`; a data set or a time of day stands in `text` alone."""
-
-    kind: str
-    text: str
-    """As it was said."""
-    value: float | None = None
-    unit: str = ""
-
-
 def constraints(instruction: str) -> tuple[Constraint, ...]:
     """Return the constraints that an instruction states, in a fixed order of kinds."""
     text = " ".join(instruction.casefold().split())
@@ -89,24 +78,6 @@ def constraints(instruction: str) -> tuple[Constraint, ...]:
             covered += f" {name}"
             found.append(Constraint(kind="dataset", text=name))
     return tuple(sorted(found, key=lambda each: (_ORDER.index(each.kind), text.find(each.text))))
-
-
-class Allocation(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a plan asks of pools, for one image and set of volumes."""
-
-    image: str
-    cpu: float
-    memory_mb: int
-    volumes: tuple[str, ...] = ()
-    count: int = 1
-    """Containers that are needed at the same time."""
-    start_s: float = 0.0
-    """Expected from the plan's beginning until the first is needed."""
-    busy_s: float = 0.0
-    """Expected from then until the last is done."""
-    subtasks: tuple[str, ...] = ()
-    seen_mb: float = 0.0
-    """Most memory that runs of these skills took lately; 0: not known."""
 
 
 def starts(plan: Plan, seconds: Mapping[str, float]) -> dict[str, float]:
@@ -176,39 +147,6 @@ DEFAULT_S = 3.0
 """Expected of a skill of which nothing is known."""
 
 
-class Parameter(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One parameter of a subtask, as it was understood."""
-
-    subtask: str
-    name: str
-    value: str | float | tuple[str, ...]
-    unit: str = ""
-    """`s`, `ms`, `m` or `mps`; empty for text and plain numbers."""
-
-
-class Able(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Who can do what one robot of the plan (or a label such as `any1`) has to do."""
-
-    label: str
-    skills: tuple[str, ...]
-    robots: tuple[str, ...] = ()
-    """The most reliable by experience first."""
-    shunned: dict[str, str] = {}
-    """Of these, who is chosen last, and why."""
-
-
-class Analysis(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What an instruction asks for."""
-
-    domain: str
-    parameters: tuple[Parameter, ...] = ()
-    constraints: tuple[Constraint, ...] = ()
-    able: tuple[Able, ...] = ()
-    allocation: tuple[Allocation, ...] = ()
-    expected_s: float = 0.0
-    """How long the plan takes when nothing waits."""
-
-
 def analyse(
     instruction: str,
     plan: Plan,
@@ -232,10 +170,13 @@ def analyse(
         reliability: skill, robot -> share of successes expected.
         shuns: skill, robot -> why the robot is chosen last, or "".
     """
+    unmeasured: dict[str, None] = {}
 
     def takes(subtask: Subtask) -> float:
         asked = subtask.params.get("duration_s", 0.0)
         known = expected_s(subtask.skill, subtask.robot or "")
+        if known is None and not asked:
+            unmeasured[subtask.skill] = None
         expected = DEFAULT_S if known is None else known
         return max(expected, asked) if isinstance(asked, int | float) and 0 < asked < 86_400 else expected
 
@@ -256,6 +197,7 @@ def analyse(
         able=_able(plan, catalogue, robots, reliability, shuns),
         allocation=allocation,
         expected_s=round(max((each.start_s + each.busy_s for each in allocation), default=0.0), 2),
+        unmeasured=tuple(unmeasured),
     )
 
 

@@ -2,7 +2,7 @@
 
 Every prediction is on the disk before the next case begins, so an interrupted run has lost nothing, and a run that is
 started again goes on behind the last one. A case without a plan gets a line too, with the reason, so that the output
-has an answer to each case. Lines that are no case are told with their numbers and left out.
+has an answer to each case. Lines that are no case are reported with their numbers and left out.
 """
 
 import json
@@ -17,8 +17,10 @@ from msgspec.structs import replace
 
 from appliance.errors import ConfigError, NotFoundError, PlanError, RecordError
 from appliance.llm.cascade import Decomposer
+from appliance.llm.preprocessing import training_refused
 from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.llm.stop_words import stop_request
+from appliance.llm.training_words import training_request
 from appliance.model import Plan, RobotInfo, Site, Verdict
 from appliance.skills.catalogue import Catalogue
 
@@ -228,6 +230,8 @@ async def predicted(
     )
     if (stop := stop_request(case.instruction, case.robots or ())) is not None:
         return prediction(case.id, None, "a stop, not a task", decision=Verdict.STOP, stops=stop.robots)
+    if (training := training_request(case.instruction, case.robots or ())) is not None:
+        return prediction(case.id, None, training_refused(training).message)
     try:
         outcome = await decomposer.plan(PlanContext(instruction=case.instruction, robots=robots, site=site))
     except PlanError as error:

@@ -21,19 +21,19 @@ import structlog
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, DeadlineError, PlanError, RefusedError, SwiftbotError
-from appliance.llm.analysis import Analysis, analyse
+from appliance.llm.analysis import analyse
 from appliance.llm.checks.schema import MAX_PROBLEMS, validate
 from appliance.llm.completion import completed
 from appliance.llm.feedback import Memory
-from appliance.llm.peers import ProposeAsk, Proposed
 from appliance.llm.plan_cache import catalogue_digest, digest, plan_key
-from appliance.llm.preprocessing import explained, no_plan, refused, stop_refused, told
+from appliance.llm.preprocessing import explained, no_plan, refused, stop_refused, told, training_refused
 from appliance.llm.review import Facts, Review, reasons, review
 from appliance.llm.routing import Budget, Gate, Privacy, Thresholds
 from appliance.llm.settings import LlmConfig, PlanContext, PlanOutcome, SafetyConfig, so_far
 from appliance.llm.stop_words import stop_request
 from appliance.llm.tier import Planner, Proposal
 from appliance.llm.tiers import Slot, configured
+from appliance.llm.training_words import training_request
 from appliance.model import (
     Finding,
     Plan,
@@ -48,6 +48,7 @@ from appliance.model import (
     UpstreamStatus,
     plan_hash,
 )
+from appliance.model.planner_api import Analysis, ProposeAsk, Proposed
 from appliance.skills.catalogue import Catalogue
 
 _LATEST = 64
@@ -125,7 +126,7 @@ class Figures:
 
 
 if TYPE_CHECKING:
-    from appliance.llm.api import Swapped
+    from appliance.model.planner_api import Swapped
 
 
 log = structlog.get_logger(__name__)
@@ -286,11 +287,13 @@ class Decomposer:
 
         if (stop := stop_request(context.instruction, [each.id for each in context.robots or ()])) is not None:
             raise stop_refused(stop)
+        if (training := training_request(context.instruction, [each.id for each in context.robots or ()])) is not None:
+            raise training_refused(training)
 
         words = told(context)
 
         def judge(plan: Plan, confidence: float, run_from: float) -> tuple[Plan, Review]:
-            whole, added = completed(words.restored(plan), context, self._catalogue)
+            whole, added = completed(words.restored(plan, verbatim=self._catalogue.verbatim), context, self._catalogue)
             found = self._review(whole, context, confidence=confidence, run_from=run_from, added=added)
             return whole, found
 
@@ -305,9 +308,9 @@ class Decomposer:
         problems: Callable[[Plan], Sequence[str]],
         rest: Callable[[Plan], Plan],
     ) -> PlanOutcome:
-        """Plan anew what is left of a task in which something failed.
+        """Make a new plan for what is left of a task in which something failed.
 
-        The tiers are told what is done, running, failed and open, and answer with a whole plan; it passes the same
+        The tiers get what is done, running, failed and open, and answer with a whole plan; it passes the same
         checks as any, as far as it is not begun yet, and `problems` besides.
 
         Args:

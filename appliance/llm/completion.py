@@ -1,7 +1,8 @@
 """What a plan leaves to the site and the roster: the way to a thing, and the one robot that can do it. Pure.
 
 An order such as "fetch the red box" names no place; the site knows where the box is, so its robot is sent there first.
-An order that names no robot is given to the one robot that can do it, where there is only one.
+An order that names no robot is given to the one robot that can do it, where there is only one; one to "a drone" to a
+drone, since the scheduler would choose among all robots that can do it.
 """
 
 import re
@@ -15,6 +16,7 @@ from appliance.llm.checks.safety import robots_of
 from appliance.llm.checks.schema import is_unnamed
 from appliance.llm.checks.things import away, sent_elsewhere
 from appliance.llm.settings import PlanContext, SafetyConfig
+from appliance.llm.shortlist import NOT_DOING, natural
 from appliance.model import Plan, Subtask
 from appliance.skills.catalogue import Catalogue
 
@@ -42,14 +44,24 @@ def completed(plan: Plan, context: PlanContext, catalogue: Catalogue) -> tuple[P
 
 
 def _bound(facts: Facts) -> Plan:
-    """Give what is asked of an unnamed robot to the only one that can do it."""
+    """Give what is asked of an unnamed robot to the only one that can do it, and of "a drone" to a drone."""
     if not facts.robots:
         return facts.plan
+    labels = sorted({name for each in facts.plan.subtasks for name in robots_of(each) if is_unnamed(name)})
+    used = {name for each in facts.plan.subtasks for name in robots_of(each)}
+    # "A drone follows drone_1": a robot that has a name in the words is not the one without.
+    used |= {name for each in facts.reading.tokens if each.group == "one" or each.listed for name in each.robots}
+    there = {each.id: each.online for each in facts.robots}
     only: dict[str, str] = {}
-    labels = {name for each in facts.plan.subtasks for name in robots_of(each) if is_unnamed(name)}
     for label in labels:
         able = candidates(facts, label)
-        if len(able) == 1 and len(labels) == 1:
+        meant = _one_of(facts, label)
+        within = [each for each in able if each in meant]
+        free = [each for each in within if each not in used and each not in only.values()]
+        if free and len(within) < len(able):
+            # Any robot could be chosen otherwise, and the words say which kind.
+            only[label] = min(free, key=lambda each: (not there[each], natural(each)))
+        elif len(able) == 1 and len(labels) == 1:
             only[label] = able[0]
     if not only:
         return facts.plan
@@ -57,6 +69,31 @@ def _bound(facts: Facts) -> Plan:
         replace(each, robot=only.get(each.robot, each.robot)) if each.robot else each for each in facts.plan.subtasks
     )
     return replace(facts.plan, subtasks=subtasks)
+
+
+def _one_of(facts: Facts, label: str) -> frozenset[str]:
+    """The robots one of which the words have do what a plan gives to an unnamed one; none where that is not clear."""
+    tokens, sentence = facts.reading.tokens, facts.reading.sentence
+    values = set[int]().union(*facts.account.values.values())
+    doing = [
+        number
+        for number, each in enumerate(tokens)
+        if each.kind == "robot"
+        and each.robots
+        and number not in values
+        and not (number and tokens[number - 1].text in NOT_DOING)
+    ]
+    said: set[tuple[str, frozenset[str]]] = set()
+    for each in facts.plan.subtasks:
+        if label in robots_of(each):
+            for index in facts.account.values[each.id] or facts.account.called[each.id]:
+                earlier = [number for number in doing if number <= index]
+                there = [number for number in doing if sentence[number] == sentence[index]]
+                # "Photograph the gate with a drone": behind what it does, and nobody else is there.
+                who = earlier[-1] if earlier else there[0] if len(there) == 1 else None
+                said.add(("", frozenset()) if who is None else (tokens[who].group, frozenset(tokens[who].robots)))
+    group, robots = next(iter(said)) if len(said) == 1 else ("", frozenset[str]())
+    return robots if group == "any" else frozenset()
 
 
 def _sent(facts: Facts) -> Plan:

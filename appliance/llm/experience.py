@@ -25,6 +25,7 @@ from appliance.model import (
     TaskState,
     plan_hash,
 )
+from appliance.model.planner_api import Row
 
 NOT_ITS_FAULT = frozenset({"unreachable", "refused", "pool", "stopped", "orphaned", "cancelled", "prerequisite"})
 """Codes of failures that are of gateways, containers and people."""
@@ -148,25 +149,6 @@ class Tally(Struct, kw_only=True):
     """Of the latest failure."""
     durations_s: deque[float]
     peak_mb: float = 0.0
-
-
-class Row(Struct, frozen=True, kw_only=True):
-    """The same, for people and for the store."""
-
-    skill: str
-    robot: str
-    good: float
-    """Successes, weighed by age."""
-    bad: float
-    reliability: float
-    """Share of successes that is expected of the next runs."""
-    expected_s: float | None = None
-    peak_mb: float = 0.0
-    durations_s: tuple[float, ...] = ()
-    why: str = ""
-    shunned: bool = False
-    """Whether other robots are given the skill first."""
-    age_s: float = 0.0
 
 
 class Experience:

@@ -1,6 +1,6 @@
 """What a gateway's planner remembers: experience, plan cache, thresholds, and what upstream has cost.
 
-Each gateway hears the last record of every task of the fleet, whoever coordinated it, so that all of them learn the
+Each gateway hears the last record of every task of the fleet, from any coordinator, so that all of them learn the
 same without asking anybody; one that was away has missed some, and learns on. What is remembered is kept in the
 gateway's store and written together now and then: a second of it may be lost with the power.
 """
@@ -16,10 +16,11 @@ import msgspec
 import structlog
 
 from appliance.errors import SwiftbotError
-from appliance.llm.experience import Experience, Row, outcomes, plan_outcomes
+from appliance.llm.experience import Experience, outcomes, plan_outcomes
 from appliance.llm.plan_cache import Kept, PlanCache
 from appliance.llm.routing import Budget, Spent, Thresholds
 from appliance.model import Plan, TaskRecord, TaskState, encode
+from appliance.model.planner_api import Row
 
 log = structlog.get_logger(__name__)
 
@@ -30,7 +31,7 @@ _THRESHOLDS = "planner/thresholds"
 _SPENT = "planner/spent"
 WRITE_S = 2.0
 MOST_HEARD = 4096
-"""Tasks whose end was heard and is not counted again: records are told more than once."""
+"""Tasks whose end was heard and is not counted again: records are published more than once."""
 _FINAL = (b'"state":"succeeded"', b'"state":"failed"', b'"state":"cancelled"')
 
 
@@ -87,7 +88,7 @@ class Memory:
         self._writer: asyncio.Task[None] | None = None
 
     async def load(self, store: Store | None = None) -> None:
-        """Read what was kept; what cannot be read is learned anew."""
+        """Read what was kept; what cannot be read is learned again."""
         self._store = store or self._store
         if self._store is None:
             return
@@ -117,7 +118,7 @@ class Memory:
                 return
             record = msgspec.json.decode(payload, type=TaskRecord)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-            return  # whoever keeps the record counts it
+            return  # the gateway that keeps the record counts it
         if key.endswith(f"/task/{record.id}/record"):
             self.learn(record)
 

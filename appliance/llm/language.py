@@ -18,7 +18,8 @@ the first and last word, so that a name that no training data has is copied whol
 Subtasks have the numbers 1, 2, … in the order they stand in, and come after those whose numbers follow "<". The name
 of a parameter says what a text is: a name, a free text, a quantity or a robot (`values`). `read` of what `write` wrote
 is the same plan, for every plan of the catalogue; `write` chooses the shortest, then the first run of the instruction's
-words that means a value, and a word of the roster only if there is none: whoever is named is copied from where he is.
+words that means a value, and a word of the roster only if there is none: a robot that is named is copied from where its
+name stands.
 
 `Guide` says which symbols may come next. An answer that is held to it is a plan over the catalogue and over these
 words: no skill, parameter or robot that is not there, no edge to a later subtask, nothing required left out, no number

@@ -1,8 +1,8 @@
 """The local tier: the gateway's end of the model's process (`worker`), its queue, and the change of models.
 
 The process loads in the background, so that a gateway is up before its model is, and is started again with growing
-pauses when it dies; each instruction in the meantime is told why there is no answer. A request that nobody waits for
-any more is broken off in the process; answers carry the number of their request, and late ones are dropped.
+pauses when it dies; each instruction in the meantime gets the reason why there is no answer. A request that nobody
+waits for any more is broken off in the process; answers carry the number of their request, and late ones are dropped.
 
 Instructions are put to it one at a time. A bounded number may wait; one more is refused with the time after which to
 ask again, so that the next tier is asked at once. Another model is loaded beside the one that serves, has to pass a
@@ -38,17 +38,18 @@ from appliance.errors import (
     from_code,
 )
 from appliance.llm import frames
-from appliance.llm.api import Swapped
 from appliance.llm.checks.schema import validate
 from appliance.llm.decoder import Question, Said
 from appliance.llm.language import Answer, read, shapes
 from appliance.llm.prompt import messages, plan_grammar, read_plan, robot_names
 from appliance.llm.review import INTRINSIC, Facts, review
 from appliance.llm.settings import KNOWN_TIERS, LlmConfig, PlanContext, SafetyConfig, folder_of, remedy_of
+from appliance.llm.shortlist import shortlist
 from appliance.llm.tier import Proposal
 from appliance.llm.tiers import Slot, local
 from appliance.llm.words import words_of
 from appliance.model import Plan, RobotInfo, Severity, SlotStatus, Tier
+from appliance.model.planner_api import Swapped
 from appliance.skills.catalogue import Catalogue
 
 log = structlog.get_logger(__name__)
@@ -122,7 +123,7 @@ class ModelProcess:
             raise self.problem or UnreachableError("the local model is not ready", remedy="try again")
 
     async def exchange(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Ask and wait for the answer; when the wait is cancelled the process is told to break off.
+        """Ask and wait for the answer; when the wait is cancelled, so is the request in the process.
 
         Raises:
             UnreachableError: the process died, or is being restarted.
@@ -304,6 +305,8 @@ _FAR = 0.05
 _ODD = 0.5
 """The same for a plan that only leaves a word over."""
 _TELLING = frozenset(("idle_robot", "quantity", "sequence", "assignment", "negation", "repeated", "unnamed_robot"))
+_TYPED = 3.0
+"""Times as sure another wording has to be than the typed one that its plan is taken instead, where the two differ."""
 _LATEST = 32
 """Answers from which the rates are taken."""
 _SELF_TEST = (
@@ -527,21 +530,60 @@ class LocalTier:
         """Ask a model that writes the plan language."""
         if context.so_far:
             raise PlanError("the embedded model cannot continue a task that has begun", remedy="another tier is asked")
-        robots = None if context.robots is None else tuple(robot.id for robot in context.robots)
-        question = Question(
-            text=context.instruction, robots=robots, skills=self._shapes, deadline_s=self._config.local_deadline_s
-        )
-        began = time.monotonic()
-        proposals = self._read(await self._asked(process, question), context, process)
-        best, held = self._best(proposals, context)
+        shown = shortlist(context)
+        best = await self._likeliest(process, shown.names, shown.forms(context))
+        return msgspec.structs.replace(best, plan=shown.whole(best.plan, context.robots, self._catalogue))
+
+    async def _likeliest(
+        self, process: ModelProcess, names: tuple[str, ...] | None, forms: Sequence[PlanContext]
+    ) -> Proposal:
+        """Return the likeliest answer that breaks no rule of plans; where all do, the best of what can be had in time.
+
+        Args:
+            process: the model's.
+            names: the roster of its prompt.
+            forms: the instruction in one or two wordings. A model errs in one where it is right in the other, and is
+                less sure then.
+
+        Raises:
+            PlanError, DeadlineError, UnreachableError: there is no answer to any.
+        """
+        until = time.monotonic() + self._config.local_deadline_s
+        found: list[tuple[tuple[int, int], Proposal, PlanContext]] = []
+        problem: SwiftbotError | None = None
+
+        async def ask(context: PlanContext, known: Sequence[Proposal] = (), *, thorough: bool = False) -> None:
+            question = Question(
+                text=context.instruction,
+                robots=names,
+                skills=self._shapes,
+                deadline_s=until - time.monotonic(),
+                thorough=thorough,
+            )
+            answers = self._read(await self._asked(process, question), question, process)
+            best, rank = self._best([*known, *answers], context)
+            found.append((rank, best, context))
+
+        def preference(each: tuple[tuple[int, int], Proposal, PlanContext]) -> tuple[tuple[int, int], float]:
+            rank, proposal, context = each
+            typed = len(forms) > 1 and context is forms[-1]
+            same = all(proposal.plan.subtasks == other.plan.subtasks for _, other, _ in found)
+            return rank, -proposal.confidence * (_TYPED if typed and not same else 1.0)
+
+        for context in forms:
+            try:
+                await ask(context)
+            except (PlanError, DeadlineError, UnreachableError) as error:
+                problem = problem or error
+        if not found:
+            raise problem or UnreachableError("the local model gave no answer")
+        rank, best, context = min(found, key=preference)
         # What breaks a rule of plans was not meant; the next likely answer that breaks none was. Where all do, others
         # are looked for once, in the time that is left.
-        left_s = question.deadline_s - (time.monotonic() - began)
-        if held and left_s > 0:
-            thorough = msgspec.structs.replace(question, thorough=True, deadline_s=left_s)
+        if rank[0] and time.monotonic() < until:
             with contextlib.suppress(PlanError, DeadlineError, UnreachableError):
-                more = self._read(await self._asked(process, thorough), context, process)
-                best, _ = self._best([best, *more], context)
+                await ask(context, [best], thorough=True)
+                best = found[-1][1]
         return best
 
     async def _asked(self, process: ModelProcess, question: Question) -> Said:
@@ -550,9 +592,9 @@ class LocalTier:
         log.debug("local model answered", symbols=" ".join(said.symbols), confidence=said.confidence, ms=said.ms)
         return said
 
-    def _read(self, said: Said, context: PlanContext, process: ModelProcess) -> list[Proposal]:
+    def _read(self, said: Said, question: Question, process: ModelProcess) -> list[Proposal]:
         """Return the answers as plans, likelier ones first; PlanError when the likeliest is none, or a refusal."""
-        words = words_of(context.instruction, [robot.id for robot in context.robots or ()])
+        words = words_of(question.text, question.robots or ())
         answer = read(said.symbols, words, self._catalogue)
         if answer.refused:
             raise PlanError(f"there is nothing to do: {_NO_PLAN.get(answer.refused, answer.refused)}")
@@ -562,8 +604,8 @@ class LocalTier:
                 found.append(_proposed(read(other.symbols, words, self._catalogue), other.confidence, process))
         return found
 
-    def _best(self, proposals: Sequence[Proposal], context: PlanContext) -> tuple[Proposal, bool]:
-        """Return the likeliest by its own confidence and by the review, and whether a check spoke against it.
+    def _best(self, proposals: Sequence[Proposal], context: PlanContext) -> tuple[Proposal, tuple[int, int]]:
+        """Return the likeliest by its own confidence and by the review, and its rank (`_rank`).
 
         One that a check holds is not given up for one that is far less likely.
         """
@@ -575,7 +617,7 @@ class LocalTier:
             if least and proposals[best].confidence < least * proposals[number].confidence:
                 best = number
                 break
-        return proposals[best], ranks[best][0] > 0
+        return proposals[best], ranks[best]
 
     def _rank(self, plan: Plan, context: PlanContext) -> tuple[int, int]:
         """Return how little a plan can be what was meant, and whether a check holds it that is less telling.

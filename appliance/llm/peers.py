@@ -9,31 +9,15 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 
 import structlog
-from msgspec import Struct
 
 from appliance.errors import DeadlineError, PlanError, SwiftbotError, UnreachableError
 from appliance.llm.routing import Breaker
 from appliance.llm.settings import LlmConfig, PlanContext
 from appliance.llm.tier import Proposal
-from appliance.model import GatewayStatus, Plan, RobotInfo, Tier
+from appliance.model import GatewayStatus, Plan, Tier
+from appliance.model.planner_api import ProposeAsk, Proposed
 
 log = structlog.get_logger(__name__)
-
-
-class ProposeAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`propose`: what does the local model of the asked gateway make of an instruction?"""
-
-    instruction: str
-    robots: tuple[RobotInfo, ...] | None = None
-    """The roster of the gateway that asks, so that both mean the same robots."""
-
-
-class Proposed(Struct, frozen=True, kw_only=True):
-    """A plan that is not reviewed yet, and how sure the model is of it."""
-
-    plan: Plan
-    confidence: float
-    model: str = ""
 
 
 Ask = Callable[[str, ProposeAsk, float], Awaitable[Proposed]]

@@ -2,7 +2,7 @@
 
 A plan comes in only when a task with it has succeeded without a revision, and goes for good when one with it fails: a
 cache of plans that were never carried out would repeat mistakes at full confidence. It is bounded; the plan that was
-used longest ago goes first. Whoever takes a plan out checks it again as any other.
+used longest ago goes first. A plan that is taken out is checked again like any other.
 
 The same words, for the same fleet, under the same rules, have the same key. The instruction is brought to one form as
 far as that cannot change what it means: typography, blanks, case outside quotes, courtesy at its ends. Whatever else a

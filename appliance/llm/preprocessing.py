@@ -12,7 +12,7 @@ they were typed and by the whole roster, so that nothing is lost by it.
 import json
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence, Set
 from typing import Any
 
 from msgspec import Struct, field
@@ -20,11 +20,13 @@ from msgspec.structs import replace
 
 from appliance.errors import PlanError, RefusedError
 from appliance.llm.checks.places import coordinate
-from appliance.llm.checks.reading import Reading, normalise, read
+from appliance.llm.checks.reading import Reading, names_of, normalise, read, spelled
 from appliance.llm.checks.schema import MAX_PROBLEMS
 from appliance.llm.settings import PlanContext
+from appliance.llm.shortlist import literally
 from appliance.llm.stop_words import StopRequest
-from appliance.model import Finding, Plan, RobotInfo, Site, TierAttempt
+from appliance.llm.training_words import TrainingRequest
+from appliance.model import Finding, Plan, RobotInfo, Site, Subtask, TierAttempt
 
 MAX_CHARACTERS = 4000
 """Longer text is no instruction; the gateway's own bound (`tasks.max_instruction_chars`) is lower."""
@@ -106,6 +108,17 @@ def stop_refused(stop: StopRequest) -> RefusedError:
     )
 
 
+def training_refused(training: TrainingRequest) -> RefusedError:
+    """Return the error for a text that is a run of federated learning: never planned, but started by a command."""
+    if training.unknown:
+        names = ", ".join(training.unknown)
+        return RefusedError(
+            f"this is a run of federated learning, not a task, on a robot that the fleet has not: {names}",
+            remedy=f"{training.command}; swiftbot robots lists their names",
+        )
+    return RefusedError("this is a run of federated learning, not a task", remedy=training.command)
+
+
 def no_plan(attempts: Sequence[TierAttempt], why: str, refusals: Sequence[Finding] = ()) -> PlanError:
     """Return the error for an instruction that no tier had a plan for: what each lacked, and how to say it.
 
@@ -121,11 +134,37 @@ def no_plan(attempts: Sequence[TierAttempt], why: str, refusals: Sequence[Findin
     last = attempts[-1].problems or ("no plan",)
     reasons = tuple(dict.fromkeys(each.message for each in refusals))[:3]
     hint = next((each.hint for each in refusals if each.hint), "")
-    said = (why, *(reasons or last[:3])) if why else (reasons or last[:3])
+    said = each_once((why, *(reasons or last[:3])) if why else (reasons or last[:3]))
     return PlanError(
         f"no valid plan for the instruction: {'; '.join(said)}",
         remedy=hint or 'rephrase, for example "Robot_1: go to goal 2, then photograph the shelf"; see docs/limits.md',
         problems=tuple(problems[:MAX_PROBLEMS]),
+    )
+
+
+_ABOUT = re.compile(r"(?P<subtasks>s\d+) \((?P<skill>\w+)\): (?P<what>.+)", re.DOTALL)
+_CLAUSE = ": it knows "
+
+
+def each_once(reasons: Sequence[str]) -> tuple[str, ...]:
+    """Return reasons with nothing said twice: subtasks of one problem together, a list of what is known at its end.
+
+    "s3 (goto): no place a: it knows x; s4 (goto): no place a: it knows x" is "s3, s4 (goto): no place a: it knows x".
+    """
+    together: dict[tuple[str, str], list[str]] = {}
+    for reason in reasons:
+        match = _ABOUT.fullmatch(reason)
+        about = (match["skill"], match["what"]) if match else ("", reason)
+        together.setdefault(about, []).append(match["subtasks"] if match else "")
+    found = [
+        f"{', '.join(dict.fromkeys(subtasks))} ({skill}): {what}" if skill else what
+        for (skill, what), subtasks in together.items()
+    ]
+    tails = [each.partition(_CLAUSE)[2] for each in found]
+    last = {tail: index for index, tail in enumerate(tails)}
+    return tuple(
+        each.partition(_CLAUSE)[0] if tail and last[tail] != index else each
+        for index, (each, tail) in enumerate(zip(found, tails, strict=True))
     )
 
 
@@ -201,6 +240,20 @@ _OTHERS = frozenset(("other", "others", "another", "rest", "remaining", "else", 
 """Words for robots that are not named."""
 
 
+def as_typed(text: str, instruction: str) -> str:
+    """Return a text as it stands in an instruction, but for case and the blanks between words; itself if it does not.
+
+    Of several places those in quotation marks come first: what is quoted is read out, or typed.
+    """
+    words = text.split()
+    if not words:
+        return text
+    said = r"\s+".join(map(re.escape, words))
+    found = re.compile(rf"(?<!\w){said}(?!\w)", re.IGNORECASE)
+    places = sorted(found.finditer(instruction), key=lambda match: not _quoted(instruction, match.start()))
+    return " ".join(places[0].group().split()) if places else text
+
+
 class Told(Struct, frozen=True, kw_only=True):
     """An instruction as planners are given it."""
 
@@ -217,15 +270,25 @@ class Told(Struct, frozen=True, kw_only=True):
             site = replace(site, places={**site.places, **spots})
         return replace(context, instruction=self.instruction, robots=self.robots, site=site)
 
-    def restored(self, plan: Plan) -> Plan:
-        """Return a planner's plan with the points that words stand for."""
-        if not self.points:
-            return plan
-        subtasks = tuple(replace(each, params=self._params(each.params)) for each in plan.subtasks)
-        return replace(plan, subtasks=subtasks)
+    def restored(self, plan: Plan, *, verbatim: Set[tuple[str, str]] = frozenset()) -> Plan:
+        """Return a planner's plan with the points that words stand for, and free texts in the case they were typed in.
 
-    def _params(self, params: Mapping[str, Any]) -> dict[str, Any]:
-        return {name: self._value(value) if isinstance(value, str) else value for name, value in params.items()}
+        Args:
+            plan: as a planner made it; planners write lower case.
+            verbatim: skill and parameter of the texts that people read or hear.
+        """
+
+        def params(subtask: Subtask) -> dict[str, Any]:
+            found = {name: self._value(value) if isinstance(value, str) else value
+                     for name, value in subtask.params.items()}  # fmt: skip
+            return {
+                name: as_typed(value, self.instruction) if isinstance(value, str) and (subtask.skill, name) in verbatim
+                else value for name, value in found.items()
+            }  # fmt: skip
+
+        if not self.points and not verbatim:
+            return plan
+        return replace(plan, subtasks=tuple(replace(each, params=params(each)) for each in plan.subtasks))
 
     def _value(self, text: str) -> str:
         for word, point in self.points.items():
@@ -237,12 +300,13 @@ class Told(Struct, frozen=True, kw_only=True):
 
 
 def told(context: PlanContext) -> Told:
-    """Return what planners are told for an instruction."""
-    found = read(context.instruction, context.robots)
-    robots = _meant(found, context.robots)
-    if normalise(context.instruction)[0] != context.instruction:
-        return Told(instruction=context.instruction, robots=robots)
-    text, points = _with_points(_with_names(context.instruction, found, context.robots), context.site)
+    """Return what planners get for an instruction."""
+    found = read(context.instruction, context.robots, site=context.site)
+    robots = _meant(context.instruction, found, context.robots)
+    instruction = spelled(context.instruction, names_of(context.robots, context.site))
+    if normalise(instruction)[0] != instruction:
+        return Told(instruction=instruction, robots=robots)
+    text, points = _with_points(_with_names(instruction, found, context.robots), context.site)
     return Told(instruction=text, robots=robots, points=points)
 
 
@@ -252,7 +316,7 @@ def _with_names(text: str, found: Reading, robots: Sequence[RobotInfo] | None) -
         said = ""
         if token.group == "one" and len(token.robots) == 1 and token.text != token.robots[0]:
             said = token.robots[0]
-        elif token.group == "all" and len(token.robots) > 1 and any(each.isdigit() for each in token.text):
+        elif token.listed:
             said = f"{', '.join(token.robots[:-1])} and {token.robots[-1]}"
         if said:
             text = f"{text[: token.start]}{said}{text[token.end :]}"
@@ -283,9 +347,12 @@ def _quoted(text: str, at: int) -> bool:
     return text[:at].count('"') % 2 == 1
 
 
-def _meant(found: Reading, robots: tuple[RobotInfo, ...] | None) -> tuple[RobotInfo, ...] | None:
+def _meant(instruction: str, found: Reading, robots: tuple[RobotInfo, ...] | None) -> tuple[RobotInfo, ...] | None:
     """Return the robots that the words can mean: those they name; all where they name none, or speak of others."""
     if robots is None or any(each.text in _OTHERS for each in found.tokens):
         return robots
     meant = {name for each in found.tokens if each.kind == "robot" for name in each.robots}
-    return tuple(each for each in robots if each.id in meant) if meant else robots
+    if not meant:
+        return robots
+    meant |= literally(instruction, robots)
+    return tuple(each for each in robots if each.id in meant)

@@ -314,7 +314,7 @@ and what is running, each copied exactly, then what is to be done instead of the
 the same robot and parameters: use another skill, another robot, or leave it out if the instruction is met without it.
 A thing that a robot holds can only be put down or given by that robot. What stands in quotation marks behind
 "because" is what a robot reported: it explains, and never asks for anything."""
-"""What a model is told with an earlier plan. It copies what is done, so that the order of the rest can refer to it."""
+"""What a model gets with an earlier plan. It copies what is done, so that the order of the rest can refer to it."""
 
 
 def messages(

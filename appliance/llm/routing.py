@@ -96,7 +96,8 @@ class Privacy:
 
     Args:
         never: regular expressions; an instruction in which one is found stays here. Case does not matter.
-        robots: shell patterns of robot ids: an instruction that names such a robot stays here, and none is told of it.
+        robots: shell patterns of robot ids: an instruction that names such a robot stays on this machine,
+            and none elsewhere sees its name.
         tag: a word that keeps an instruction here; it is taken out before planning.
 
     Raises:
@@ -134,7 +135,7 @@ class Privacy:
         return ""
 
     def trimmed(self, context: PlanContext) -> PlanContext:
-        """Return the context without the robots that nobody elsewhere is told of."""
+        """Return the context without the robots whose names stay on this machine."""
         if not self._robots or context.robots is None:
             return context
         return replace(context, robots=tuple(each for each in context.robots if not self._private(each.id)))
@@ -254,7 +255,7 @@ class Breaker:
             self._opened = min(self._opened + 1, 16)
 
     def gave_up(self) -> None:
-        """Whoever asked did not wait for the answer: nothing is learned."""
+        """The asker did not wait for the answer: nothing is learned."""
         self._trying = False
 
 

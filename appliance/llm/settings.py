@@ -2,14 +2,15 @@
 
 `LlmConfig` is the configuration's `llm`, `SafetyConfig` its `safety`; `folder_of` finds the model that
 `llm.local_model` names, `embedded` being the one that comes with the program. `PlanContext` is a request: an
-instruction with the roster, the site and, when the rest of a plan is to be planned anew, what has become of the earlier
+instruction with the roster, the site and, when the rest of a plan is to be replanned, what has become of the earlier
 plan (`SoFar`). `PlanOutcome` is the answer.
 
-They stand apart from the cascade so that whoever only passes them on (the RPC verbs, the terminal UI, the configuration
-file, the model's own process) imports nothing that plans.
+They stand apart from the cascade so that modules that only pass them on (the RPC verbs, the terminal UI, the
+configuration file, the model's own process) import nothing that plans.
 """
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +20,10 @@ from appliance.errors import ConfigError
 from appliance.model import Plan, RobotInfo, Site, SubtaskState, TaskRecord, TierAttempt
 
 EMBEDDED = "embedded"
-EMBEDDED_FOLDER = Path(__file__).with_name("planner")
+_PACKAGE = Path(__file__).resolve().parents[1]
+_IN_TREE = _PACKAGE.parent / "models" / "planner"
+EMBEDDED_FOLDER = _IN_TREE if _IN_TREE.is_dir() else _PACKAGE / "data" / "planner"
+"""The planner that comes with the program: `models/planner` of a source tree, `data/planner` of an installed one."""
 
 
 def folder_of(model: str) -> str:
@@ -204,10 +208,10 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     upstream_never: tuple[str, ...] = ()
     """Regular expressions: an instruction in which one is found never leaves this machine."""
     upstream_never_robots: tuple[str, ...] = ()
-    """Shell patterns of robot ids: an instruction that names one never leaves this machine, and no server is told of
+    """Shell patterns of robot ids: an instruction that names one never leaves this machine, and no server hears of
     them."""
     upstream_private_tag: str = "#private"
-    """A word with which whoever gives an order keeps it on this machine. Empty: there is none."""
+    """A word in an order that keeps it on this machine. Empty: there is none."""
     upstream_open_s: float = 15.0
     """After three failures in a row the server is left alone for so long, twice as long each time after, up to ten
     minutes: offline is normal, and must not cost each instruction a deadline."""
@@ -277,6 +281,13 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ConfigError("llm: local_max_tokens or upstream_max_tokens", remedy="give 256 to 65536 tokens")
 
 
+class OutOfUse(Struct, frozen=True, kw_only=True):
+    """What operators have taken out of use: by name, why and until when in words."""
+
+    places: Mapping[str, str] = {}
+    robots: Mapping[str, str] = {}
+
+
 class PlanContext(Struct, frozen=True, kw_only=True):
     """What is known when an instruction arrives."""
 
@@ -285,13 +296,15 @@ class PlanContext(Struct, frozen=True, kw_only=True):
     """The roster; None when it is unknown, which an empty one is not."""
     site: Site | None = None
     so_far: SoFar | None = None
-    """What has become of an earlier plan for it; with it the rest is to be planned anew."""
+    """What has become of an earlier plan for it; with it the rest is to be replanned."""
     private: bool = False
     """The text must not leave this machine: neither the upstream tier nor another gateway is asked."""
     submitter: str = ""
     """Who asks."""
     from_robot: bool = False
     """Whether that is a robot, whom the safety policy may allow less."""
+    out_of_use: OutOfUse = OutOfUse()
+    """Places that are closed, and robots in maintenance."""
 
 
 class PlanOutcome(Struct, frozen=True, kw_only=True):

@@ -205,7 +205,8 @@ _WORDS: dict[_Kind, str] = {
         stop flying|stop everything you are doing|stop what you are doing|stop what you're doing|stop whatever you are
         doing|stop all motion|stop all movement|cease all movement|cease movement|cease operations|cease all operations|
         emergency stop|emergency halt|emergency stopp|full stop|hard stop|soft stop|all stop|panic stop|crash stop|
-        stop right there|halt right there|freeze right there|stand still|hold still|hold everything|hold it|
+        stop right there|halt right there|freeze right there|stop where you are|halt where you are|freeze where you are|
+        stop where it is|stop where they are|stand still|hold still|hold everything|hold it|
         stay where you are|stay right where you are|remain where you are|don't move|dont move|do not move|
         nobody move|nobody moves|no one move|abort mission|abort the mission|abort everything|abort all|
         stop dead|dead stop|come to a stop|come to a halt|come to a standstill|grind to a halt|
@@ -223,9 +224,16 @@ _WORDS: dict[_Kind, str] = {
         stai fermo|state fermi|non muoverti|non muovetevi|
         noodstop|stilstaan|sta stil|blijf staan|niet bewegen|
         stoj|stojcie|zatrzymaj|zatrzymaj sie|zatrzymac|zatrzymac sie|zatrzymajcie|zatrzymajcie sie|stac|
-        nie ruszaj sie|zatrzymanie awaryjne""",
+        nie ruszaj sie|zatrzymanie awaryjne|
+        стоп|стой|стойте|остановись|остановитесь|стоять|стій|зупинись|зупиніться|спри|спрете|
+        στοπ|σταμάτα|σταματήστε|σταμάτησε|
+        dur|durun|stanna|stans|seis|pysähdy|állj|zastav|zastavte|opreste|opriti|opreste te|berhenti|dung lai|
+        停|停止|停下|停下来|停下來|站住|停车|停車|緊急停止|紧急停止|止まれ|止まって|とまれ|とまって|ストップ|정지|멈춰|멈춰라|서라|
+        ruko|ruk jao|ruk ja|ruk jaao|ruk jaiye|रुको|रुक जाओ|रुक जा|रुकिए|थांब|थांबा|
+        قف|توقف|توقفي|توقفوا|עצור|עצרו|หยุด""",
     _Kind.COURTESY: """
-        please|pls|plz|plse|kindly|now|right now|right away|immediately|instantly|at once|asap|quick|quickly|fast|
+        please|pls|plz|plse|kindly|now|abhi|अभी|
+        right now|right away|immediately|instantly|at once|asap|quick|quickly|fast|
         bloody|damned|freaking|goddamn|stupid|
         just|hey|hi|hello|ok|okay|oh|ah|oi|whoa|god|my god|omg|damn|damn it|dammit|shit|fuck|fucking|crap|argh|help|
         emergency|danger|careful|watch out|look out|attention|warning|urgent|i said|i say|i repeat|repeat|thanks|
@@ -234,7 +242,13 @@ _WORDS: dict[_Kind, str] = {
         hold position|hold on|wait|wait there|stay|stay put|stay still|stay there|and stay there|you|u|yourself|
         yourselves|it|them|him|her|to|make|get|tell|order|command|let|have|i want you to|i want|we want|can you|
         could you|would you|will you|can u|can you please|can we|can everyone|can everybody|would everyone|
-        could everyone|i need you to|i order you to|guys|folks|people|mate|buddy|immediate|
+        could everyone|all stations|attention all stations|over|over and out|roger|for gods sake|for god sakes|
+        for goodness sake|for pity's sake|for pitys sake|sorry|so sorry|i am sorry|i'm sorry|excuse me|pardon me|
+        i am terribly sorry|i'm terribly sorry|sorry to interrupt|i am terribly sorry to interrupt|
+        i'm so sorry to interrupt|i am sorry to interrupt|i'm sorry to interrupt|be so kind as to|
+        would you be so kind as to|but would you be so kind as to|but could you please|but please|
+        if you would be so kind|this very instant|this very second|this very minute|
+        i need you to|i order you to|guys|folks|people|mate|buddy|immediate|
         por favor|porfavor|ya|ahora|ahora mismo|ya mismo|inmediatamente|de inmediato|enseguida|rapido|gracias|oye|
         oiga|eh|usted|ustedes|socorro|
         agora|agora mesmo|imediatamente|ja|obrigado|obrigada|voce|voces|
@@ -317,7 +331,7 @@ def _vocabulary() -> dict[tuple[str, ...], _Kind]:
     found: dict[tuple[str, ...], _Kind] = {}
     for kind, text in _WORDS.items():
         for phrase in text.split("|"):
-            words = tuple(re.findall(r"[^\W\d_]+(?:'[^\W\d_]+)*", phrase))
+            words = tuple(re.findall(r"[^\W\d_]+(?:'[^\W\d_]+)*", _plain(phrase)))
             if words:
                 found.setdefault(words, kind)
     return found
@@ -535,10 +549,13 @@ _REASONS = frozenset(
     re.findall(
         r"\S+",
         "there's theres there it's its it he's hes he she's she they're they someone somebody something because "
-        "cause cos cuz from you're youre that's thats",
+        "cause cos cuz from you're youre that's thats man woman child kid children people person worker workers "
+        "fire smoke",
     )
 )
 """Words that begin the reason of a stop: "stop the rover there's a child"."""
+_THERE = frozenset(("is", "are", "was", "were", "has", "have", "might", "may", "must", "could", "can", "will", "comes"))
+"""Words behind "there" that say what is there; behind others it says where to stop."""
 
 
 def _with_reason(said: _Sentence, roster: _Roster, budget: _Budget) -> _Heard | None:
@@ -547,6 +564,10 @@ def _with_reason(said: _Sentence, roster: _Roster, budget: _Budget) -> _Heard | 
     for at in range(1, min(len(tokens) - 1, 14)):
         if tokens[at] not in _REASONS or tokens[at : at + 4] == ["from", "time", "to", "time"]:
             continue
+        if tokens[at - 1 : at + 1] == ["over", "there"]:
+            continue  # where a robot is to stop: a step of a task
+        if tokens[at] == "there" and tokens[at + 1] not in _THERE:
+            continue  # "go to dock 1. Stop there and photograph it"
         heard = _clause(tokens[:at], roster, budget, first=said.first)
         # "stop something": without robots only a thing that is there is a reason.
         if heard is not None and (

@@ -2,7 +2,7 @@
 
 Servers differ in what `response_format` they take, so a refused `json_schema` falls back to `json_object`, and that
 to none; what worked is remembered. Failures are sorted by what helps: an answer 429 or 5xx, or no connection, is tried
-again within bounds; a refused key or an unknown model is not. The key is read anew for each request, so that a new one
+again within bounds; a refused key or an unknown model is not. The key is read for each request, so that a new one
 needs no restart, and it is never part of a message or a log line. A server that fails again and again is left alone for
 a while (`routing.Breaker`), and none is asked once the day's budget is spent: offline is normal.
 """
@@ -20,14 +20,7 @@ import msgspec
 import structlog
 from msgspec import Struct, field
 
-from appliance.errors import (
-    ConfigError,
-    DeadlineError,
-    PayloadError,
-    RefusedError,
-    SwiftbotError,
-    UnreachableError,
-)
+from appliance.errors import ConfigError, DeadlineError, PayloadError, RefusedError, SwiftbotError, UnreachableError
 from appliance.llm.prompt import MAX_ANSWER_BYTES, messages, plan_schema, read_plan
 from appliance.llm.routing import Breaker, Budget
 from appliance.llm.settings import LlmConfig, PlanContext
@@ -149,7 +142,7 @@ class UpstreamTier:
             RefusedError: the day's budget is spent.
         """
         if why := self._budget.refuses(_today()):
-            raise RefusedError(f"the upstream budget is used up: {why}", remedy="it begins anew tomorrow")
+            raise RefusedError(f"the upstream budget is used up: {why}", remedy="a new budget begins tomorrow")
         now = time.monotonic()
         if not self._breaker.take(now):
             raise UnreachableError(

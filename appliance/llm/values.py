@@ -29,7 +29,8 @@ _WORD = re.compile(r"[a-z]+|\d+(?:[.,]\d+)*|[½¼¾]|\S")
 
 def _units(**words: str) -> dict[str, float]:
     scales = {"milli": 1e-3, "centi": 0.01, "one": 1.0, "kilo": 1e3, "minute": 60.0, "hour": 3600.0, "day": 86_400.0}
-    scales |= {"foot": 0.3048, "kmh": 1 / 3.6, "knot": 0.514444}
+    scales |= {"foot": 0.3048, "yard": 0.9144, "inch": 0.0254, "mile": 1609.344}
+    scales |= {"kmh": 1 / 3.6, "knot": 0.514444, "mph": 0.44704}
     return {word: scales[scale] for scale, said in words.items() for word in said.split()}
 
 
@@ -47,12 +48,21 @@ _UNITS = {
         day="day days",
     ),
     "ms": _units(one=_MILLISECONDS, kilo=_SECONDS),
-    "m": _units(centi=_CENTIMETRES, one=_METRES, kilo=_KILOMETRES, foot="ft foot feet"),
+    "m": _units(
+        centi=_CENTIMETRES,
+        one=_METRES,
+        kilo=_KILOMETRES,
+        foot="ft foot feet",
+        yard="yd yds yards",  # the singular is a place
+        inch="inch inches",
+        mile="mile miles",
+    ),
     "mps": _units(
         centi=f"cmpers {_CENTIMETRES}",
         one=f"mps mpers {_METRES} second s hour h",
         kmh=f"kmh kph kmperh {_KILOMETRES}",
         knot="knot knots",
+        mph="mph mile miles",
     ),
 }
 """Words for units, in the unit of the parameter whose name ends in it."""

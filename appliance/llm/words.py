@@ -9,11 +9,13 @@ it, and the end of a line parts as a mark does. A letter stands before an item o
 another (a, b, c): else it is somebody's initial ("A. Smith waits").
 
 `singular` gives the singular of a name, as people give names to things and places; `between` the numbers and letters
-that are meant without being said, those between the ends of "pumps 4 to 7" and "bays A to D".
+that are meant without being said, those between the ends of "pumps 4 to 7" and "bays A to D"; `forms` the forms of a
+verb as orders use them.
 """
 
 import re
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 
 from msgspec import Struct
 
@@ -190,3 +192,39 @@ def _inside(first: str, last: str) -> list[str]:
     if first.isalpha() and last.isalpha():
         return [chr(each) for each in range(ord(first) + 1, ord(last))] if ord(last) - ord(first) <= MOST else []
     return []
+
+
+_IRREGULAR = {
+    "go": ("goes", "going", "gone", "went"), "fly": ("flies", "flying", "flown"), "take": ("takes", "taking", "taken"),
+    "put": ("puts", "putting"), "bring": ("brings", "bringing", "brought"), "drive": ("drives", "driving", "driven"),
+    "get": ("gets", "getting"), "give": ("gives", "giving", "given"), "shoot": ("shoots", "shooting"),
+    "say": ("says", "saying", "said"),
+    "tell": ("tells", "telling"), "find": ("finds", "finding", "found"),
+    "hold": ("holds", "holding", "held"), "leave": ("leaves", "leaving", "left"), "set": ("sets", "setting"),
+    "shut": ("shuts", "shutting"),
+    "come": ("comes", "coming"),
+    "run": ("runs", "running"), "be": ("is", "are", "being"),
+    "read": ("reads", "reading"), "send": ("sends", "sending", "sent"), "make": ("makes", "making"),
+    "keep": ("keeps", "keeping"), "wait": ("waits", "waiting"), "let": ("lets", "letting"),
+    "lift": ("lifts", "lifting"),
+}  # fmt: skip
+
+
+@lru_cache(maxsize=4096)
+def forms(verb: str) -> frozenset[str]:
+    """Return a verb's forms as orders use them: "photograph", "photographs", "photographing", "photographed"."""
+    found = {verb, *_IRREGULAR.get(verb, ())}
+    if verb in _IRREGULAR:
+        return frozenset(found)
+    found.add(f"{verb}s")
+    if verb.endswith(("s", "x", "z", "ch", "sh", "o")):
+        found.add(f"{verb}es")
+    if len(verb) > 2 and verb.endswith("y") and verb[-2] not in "aeiou":
+        found |= {f"{verb[:-1]}ies", f"{verb[:-1]}ied"}
+    if verb.endswith("e"):
+        found |= {f"{verb[:-1]}ing", f"{verb}d"}
+    else:
+        found |= {f"{verb}ing", f"{verb}ed"}
+        if len(verb) > 2 and verb[-1] not in "aeiouwxy" and verb[-2] in "aeiou":
+            found |= {f"{verb}{verb[-1]}ing", f"{verb}{verb[-1]}ed"}
+    return frozenset(found)

@@ -5,8 +5,8 @@ stalls that long loses its leases; and a model that crashes or eats memory must 
 `python -m appliance.llm.worker FOLDER`, frames on stdin and stdout (`frames`). It ends when stdin ends.
 
 What is kept between prompts: the generator with the tokens it has seen. The next prompt rewinds to the longest common
-prefix, which is the fixed part with the catalogue, so that only the instruction is computed anew. A generator belongs
-to one grammar; the grammar changes when the roster does.
+prefix, which is the fixed part with the catalogue, so that only the instruction is computed each time. A generator
+belongs to one grammar; the grammar changes when the roster does.
 """
 
 import importlib
@@ -73,9 +73,9 @@ def check_folder(folder: Path) -> None:
 
 
 class _Loaded:
-    """A model of the library, with its tokenizer."""
+    """A model of the library, with its tokenizer: its own, or that of the planner it belongs to."""
 
-    def __init__(self, folder: Path, threads: int) -> None:
+    def __init__(self, folder: Path, threads: int, *, tokenizer: Any = None) -> None:
         check_folder(folder)
         try:
             sizes = json.loads((folder / "genai_config.json").read_text(encoding="utf-8"))["model"]
@@ -93,7 +93,7 @@ class _Loaded:
                 options = {"model": {"decoder": {"session_options": {"intra_op_num_threads": threads}}}}
                 config.overlay(json.dumps(options))
             self.model = self.og.Model(config)
-            self.tokenizer = self.og.Tokenizer(self.model)
+            self.tokenizer = tokenizer or self.og.Tokenizer(self.model)
         except Exception as error:
             # The library raises bare RuntimeErrors for whatever is wrong with the files.
             raise WorkerError(
@@ -119,7 +119,7 @@ def _speaker(folder: Path, loaded: _Loaded, threads: int) -> Speaker | None:
             other = read_card(folder / name)
             if other is None or other.tokens != card.tokens:
                 raise WorkerError("prerequisite", f"{folder / name} has not the tokens of {folder}", again)
-            voices.append(_Loaded(folder / name, threads).voice(other))
+            voices.append(_Loaded(folder / name, threads, tokenizer=loaded.tokenizer).voice(other))
         return Speaker(Voices(voices), card, evidence=read_evidence(folder))
     except (ValueError, OSError) as error:
         raise WorkerError("prerequisite", str(error), again) from error

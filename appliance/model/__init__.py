@@ -36,18 +36,7 @@ from appliance.model.plans import (
 )
 from appliance.model.robots import Pose, RobotCommand, RobotInfo, RobotLimits, RobotReply
 from appliance.model.site import Box, Device, Door, Person, Place, Site, SiteObject
-from appliance.model.steering import (
-    Act,
-    Approval,
-    Decision,
-    Enquiry,
-    Lease,
-    Lifted,
-    Pause,
-    Signed,
-    SoftStop,
-    Word,
-)
+from appliance.model.steering import Act, Approval, Decision, Enquiry, Lease, Lifted, Pause, Signed, SoftStop, Word
 from appliance.model.tasks import (
     HIGHEST_PRIORITY,
     LONGEST_DEADLINE_S,

@@ -5,9 +5,8 @@ Of its planner a gateway tells the tiers, the model's process, the plan cache, a
 
 from msgspec import Struct, field
 
-from appliance.model.messages import OpenEnum
+from appliance.model.messages import Need, OpenEnum
 from appliance.model.steering import Lease, SoftStop
-from appliance.model.tasks import Need
 
 
 class TierFigures(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -174,6 +173,10 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     cpu_percent: float = 0.0
     memory_mb: float = 0.0
     """Resident memory of the daemon."""
+    disk_free_mb: int = 0
+    """Free on the disk of its data, MiB, in steps of 64."""
+    disk_total_mb: int = 0
+    """Size of that disk, MiB; 0: not told."""
     capacity: int = 0
     """Containers it may hold."""
     containers: int = 0
@@ -204,6 +207,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Why the pool cannot start containers, or holds fewer than it may for want of memory; empty when all is well."""
     site_problem: str = ""
     """What the site's map lacks to keep robots on it, such as a fence; empty when all is well."""
+    keys_problem: str = ""
+    """What is to be done about certificates soon, such as one that expires; empty when nothing is."""
     images: tuple[str, ...] = ()
     """References of the images it has and can give to others."""
     volumes: tuple[VolumeInfo, ...] = ()
@@ -211,7 +216,7 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     models: tuple[str, ...] = ()
     """Language models it plans with, in order of asking, as `tier:name`; `rules` stands for the parser."""
     planner: PlannerStatus | None = None
-    """How its planner does; a change of it alone is told with the next status."""
+    """How its planner does; a change of it alone goes out with the next status."""
     recorders: tuple[RecorderNote, ...] = ()
     """The fleet's recorders as this gateway hears them; told at once when one misses messages."""
     robots: tuple[str, ...] = ()
@@ -226,6 +231,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     pid: int = 0
     age_ms: int = 0
     """How old its figures were when it was put."""
+    at_ns: int = 0
+    """When it was put, Unix nanoseconds, by its own clock; 0: not told."""
     stops: tuple[SoftStop, ...] = ()
     """Soft stops in force, as it knows them; at most 32, those of the whole fleet first."""
     leases: tuple[Lease, ...] = ()

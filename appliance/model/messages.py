@@ -1,6 +1,6 @@
-"""What all messages share: their encoding, failures, notices and log lines, and enumerations open to newer words.
+"""What messages share: encoding, failures, notices, log lines, needs, and enumerations open to newer words.
 
-Enumerations: a newer version may know more states, kinds and ways. Whoever decides anything must not take a word that
+Enumerations: a newer version may know more states, kinds and ways. A decision must not take a word that
 it does not know: for it enumerations are closed, and such a message is refused as malformed. A program that only
 shows must not hide what it was told: for it they are open, and unknown words are kept as they are (both terms as
 Protocol Buffers have them, "Enum behavior").
@@ -94,3 +94,12 @@ class LogLine(Struct, frozen=True, kw_only=True, omit_defaults=True):
 def encode(value: Any) -> bytes:
     """Encode a struct as JSON."""
     return msgspec.json.encode(value)
+
+
+class Need(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a subtask asks of a container: T = (image, cpu, mem, volumes) of Algorithm 1."""
+
+    image: str
+    cpu: float = 0.5
+    memory_mb: int = 128
+    volumes: tuple[str, ...] = ()

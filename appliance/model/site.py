@@ -93,6 +93,13 @@ class Site(Struct, frozen=True, kw_only=True, omit_defaults=True):
     people: tuple[Person, ...] = ()
     """People of the simulated world."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of places and their aliases, objects, doors, devices and people."""
+        places = [name for key, place in self.places.items() for name in (key, *place.aliases)]
+        things = (*self.objects, *self.doors, *self.devices, *self.people)
+        return (*places, *(each.name for each in things))
+
     def find(self, name: str) -> Place | None:
         """Return the place of that name or alias (case and articles ignored), or None."""
         wanted = " ".join(word for word in name.lower().replace("_", " ").split() if word not in ("the", "a", "an"))

@@ -114,7 +114,7 @@ class Pause(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class SoftStop(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Robots are told to hold, and are given no command until it is lifted. Not a safety-rated emergency stop."""
+    """Robots hold, and get no command until it is lifted. Not a safety-rated emergency stop."""
 
     id: Annotated[str, Meta(min_length=1, max_length=MAX_ACT)]
     robots: Annotated[tuple[str, ...], Meta(max_length=MAX_STOPPED)] = ()

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct, field
 
-from appliance.model.messages import Failure, OpenEnum
+from appliance.model.messages import Failure, Need, OpenEnum
 from appliance.model.plans import Plan, Subtask
 from appliance.model.steering import Approval, Decision, Pause, Word
 
@@ -99,15 +99,6 @@ class Way(OpenEnum):
     """A cold start."""
 
 
-class Need(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a subtask asks of a container: T = (image, cpu, mem, volumes) of Algorithm 1."""
-
-    image: str
-    cpu: float = 0.5
-    memory_mb: int = 128
-    volumes: tuple[str, ...] = ()
-
-
 class Considered(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One possibility that a selection weighed. `verdict` says in words why it was (not) taken."""
 
@@ -145,7 +136,7 @@ class RevisionKind(OpenEnum):
     SKILL = "skill"
     """A skill that its manifest names as an alternative takes the place of one that was given up."""
     PLAN = "plan"
-    """The decomposer has planned anew what was left."""
+    """The decomposer has replanned what was left."""
 
 
 class Dropped(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -191,7 +182,7 @@ class Proposal(Struct, frozen=True, kw_only=True, omit_defaults=True):
     hash: str = ""
     """Of its canonical form: an approval names it (`tasks.steering.hashing`)."""
     since_s: float = 0.0
-    """The task's `elapsed_s` when it was made: it expires so long after that, whoever coordinates the task then."""
+    """The task's `elapsed_s` when it was made: it expires so long after that, on any coordinator."""
     expires_s: float = 0.0
     """How long it waits; 0: not told."""
     at_ns: int = 0
@@ -225,14 +216,16 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     group: tuple[str, ...] = ()
     """Gateways that it may be passed on to, as the task's submitter wished; empty: any. The task's own group is no
     limit here: its members are asked first, but a container that is ready elsewhere counts for more."""
-    anew: bool = False
-    """Passed on, it may be started in a new container as well: whoever passes it on has no room for one."""
+    new_container: bool = False
+    """Passed on, it may be started in a new container as well: the gateway that passes it on has no room for one."""
     moves: int = 0
     """How often the subtask was moved from one gateway to another before."""
     expected_s: float = 0.0
     """How long runs of the skill take by the coordinator's experience; 0 when it has none."""
     avoid: tuple[str, ...] = ()
     """Gateways where earlier attempts failed: it is not passed on to them."""
+    owner: str = ""
+    """Key of the record that its files belong to and go with; empty: its task's."""
 
     @property
     def run_id(self) -> str:
@@ -419,7 +412,7 @@ class Group(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Best first by the score when it was formed."""
     root: str
     number: int = 1
-    """Counts the group's formations, so that a change is told from a repetition."""
+    """Counts the group's formations, which distinguishes a change from a repetition."""
     why: str = ""
     """How it came to be, with the scores, in words."""
 

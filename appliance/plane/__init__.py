@@ -1,11 +1,16 @@
 """The plane: Zenoh session, key space, membership, ring, replicated records and registry; knows nothing of tasks.
 
-Doors: `node.Plane` (a gateway's part in the fleet), `node.PlaneClient` (everybody else's) and `node.run_router` (what
-links a large fleet). They put together, from below:
+Doors: `node.Plane` (a gateway's part in the fleet), `client.PlaneClient` (everybody else's) and `node.run_router` (what
+links a large fleet), with `settings` and `events` (the fleet's, in one order). What they are made of is used where less
+will do: `session.Session` with `session.Closer`, `session.Message` and `session.Publisher`, `rpc.Rpc`, `dht.Dht` with
+`dht.Record` and `dht.LeaveOut`, `records` (their versions), `store.Store`, `dedup.Deduplicator`, and `backlog` (for
+recorders). A backup copies the store's file (`node.STORE_FILE`), and a restore raises its fence (`leases.FENCE`).
 
-- `keys` (alone knows key names; docs/keyspace.md describes every key) and `settings`,
+From below:
+
+- `settings` (the keys are `model.keys`, requests and replies `model.plane_api`),
 - `link` (opens a Zenoh session) and `session.Session` (put, subscribe, query, serve, liveliness), whose puts are
-  numbered by `backlog` so that a recorder can fetch what it lacks; `dedup` for whoever hears a thing twice,
+  numbered by `backlog` so that a recorder can fetch what it lacks; `dedup` for messages that come twice,
 - `rpc.Rpc` (typed requests from one gateway to another),
 - `ring` (where a key belongs; pure) and `membership` (who is there, and failure detection),
 - `records` (versions, and what becomes of a record when they meet; pure) and `store.Store` (what must not be

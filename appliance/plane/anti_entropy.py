@@ -30,11 +30,15 @@ from typing import Any, NamedTuple
 import structlog
 from msgspec import Struct
 
+from appliance.background import Background
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
+from appliance.model import keyspace
+from appliance.model.keys import check_name
+from appliance.model.plane_api import DigestAsk, DigestList, FetchAsk, FetchList, Record, StoreAsk
 from appliance.plane.dht import GONE_S, Dht
-from appliance.plane.keys import check_name
-from appliance.plane.membership import Membership, Stall, StallDetector
-from appliance.plane.records import MAX_KEY, Found, Record, StoreAsk, check_record, summary
+from appliance.plane.events import FleetEvent, FleetEvents, Joined, Lost, Relinked, RingChanged, Stage, Stalled
+from appliance.plane.membership import Membership, StallDetector
+from appliance.plane.records import MAX_KEY, check_record, summary
 from appliance.plane.ring import Ring, point
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
@@ -112,7 +116,7 @@ def _within(ring: Ring, start: int, end: int) -> tuple[int, ...]:
 AT_REST = 8
 """Members compared with in a round while nothing changes: all of a small fleet, some of a large one in turn."""
 FEW_MEMBERS = 32
-"""A fleet of so many is small: whoever comes asks all it shares records with before it shows itself, and is asked."""
+"""A fleet of so many is small: a newcomer asks all it shares records with before it shows itself, and is asked."""
 _MOST_MET = 4096
 
 
@@ -169,7 +173,7 @@ class Steps:
     def next(self, settled: Settled | None, ring: Ring, stalls: int) -> Step:
         """The next step towards a ring.
 
-        One that was away may have ordered writes on the other side of a cut: whoever shares records with it asks. Of
+        One that was away may have ordered writes on the other side of a cut: those that share records with it ask. Of
         one never seen before that is assumed in a small fleet only: a large one would ask it a hundred times.
         At rest some are asked at a time, in turn: half of those that share records, half of all, since two that lost
         sight of each other learn of it by asking.
@@ -230,42 +234,9 @@ _PAGE = 4000
 _FETCH_BYTES = 2 * 2**20
 """Values in one answer, unless a single one is larger."""
 SEE_S = 0.7
-"""How long a member waits to see the token of the one that asks: shorter than a question lasts, or whoever is not seen
-would never hear so, and show its token again. (After a loss nobody is waited for so long, `LOSS_S`; whoever was
+"""How long a member waits to see the token of the one that asks: shorter than a question lasts, or one that is not seen
+would never hear so, and show its token again. (After a loss nobody is waited for so long, `LOSS_S`; the one that was
 silent is asked once more right after it.)"""
-
-
-class DigestAsk(Struct, frozen=True, omit_defaults=True):
-    """`dht_digest`: which records that I (`asker`) should hold have you? `joining`: my token is not up yet."""
-
-    asker: str
-    summary: str = ""
-    """Of the asker's copies; when the other's is the same, there is nothing to tell."""
-    after: str = ""
-    joining: bool = False
-
-
-class DigestList(Struct, frozen=True, omit_defaults=True):
-    """Key -> digest, in order of keys; `more` when it was cut."""
-
-    digests: dict[str, str] = {}
-    same: bool = False
-    more: bool = False
-    unseen: bool = False
-    """The asker's token is not seen here, so nothing is told."""
-
-
-class FetchAsk(Struct, frozen=True):
-    """`dht_fetch`: these records, or as many of the first as fit."""
-
-    keys: tuple[str, ...]
-
-
-class FetchList(Struct, frozen=True):
-    """The records; keys that are gone are left out."""
-
-    records: tuple[Record, ...]
-    more: bool = False
 
 
 class Compared(NamedTuple):
@@ -288,6 +259,7 @@ class Comparing:
         store: Store,
         rpc: Rpc,
         membership: Membership,
+        events: FleetEvents,
         keep: Callable[[Record], Awaitable[Record]],
     ) -> None:
         self._config = config
@@ -297,16 +269,15 @@ class Comparing:
         self._membership = membership
         self._keep = keep
         self._seen = asyncio.Condition()
-        self._waking: set[asyncio.Task[None]] = set()
-        rpc.register("dht_digest", DigestAsk, self._on_digest, exchange=False)
-        rpc.register("dht_fetch", FetchAsk, self._on_fetch, exchange=False)
-        membership.on_joined.append(self._on_member)
-        membership.on_lost.append(self._on_member)
+        self._waking = Background()
+        rpc.register(keyspace.DHT_DIGEST, self._on_digest)
+        rpc.register(keyspace.DHT_FETCH, self._on_fetch)
+        events.subscribe(Stage.RECORDS, self._on_event)
 
-    def _on_member(self, _: str) -> None:
-        task = asyncio.create_task(self._wake())
-        self._waking.add(task)
-        task.add_done_callback(self._waking.discard)
+    def _on_event(self, event: FleetEvent) -> None:
+        if not isinstance(event, Joined | Lost):
+            return
+        self._waking.start(self._wake(), "compare: members have changed")
 
     async def _wake(self) -> None:
         async with self._seen:
@@ -343,13 +314,13 @@ class Comparing:
         return Compared(silent & self._membership.members, sum(each or 0 for each in results.values()))
 
     async def sees(self, name: str) -> None:
-        """Ask one that counts as lost whether it is there after all; one that does not see this gateway is told.
+        """Ask one that counts as lost whether it is there after all; one that does not see this gateway hears so.
 
         Two gateways that lost each other's tokens though they are linked would otherwise never ask each other.
         """
         with contextlib.suppress(SwiftbotError):  # nobody answers: it is gone indeed
             answer = await self._rpc.call(
-                name, "dht_digest", DigestAsk(asker=self._gateway), DigestList, timeout_s=COMPARE_S
+                name, keyspace.DHT_DIGEST, DigestAsk(asker=self._gateway), timeout_s=COMPARE_S
             )
             if answer.unseen:
                 self._membership.show_again()
@@ -371,7 +342,7 @@ class Comparing:
         asked = DigestAsk(asker=self._gateway, summary=summary(shared), joining=joining)
         fetched = 0
         while True:
-            answer = await self._rpc.call(member, "dht_digest", asked, DigestList, timeout_s=COMPARE_S)
+            answer = await self._rpc.call(member, keyspace.DHT_DIGEST, asked, timeout_s=COMPARE_S)
             if answer.unseen:
                 self._membership.show_again()
                 raise RefusedError(f"{member} does not see {self._gateway}", remedy="are the two linked?")
@@ -388,7 +359,7 @@ class Comparing:
         done = 0
         while keys:
             page = keys[:_PAGE]
-            answer = await self._rpc.call(member, "dht_fetch", FetchAsk(tuple(page)), FetchList, timeout_s=COMPARE_S)
+            answer = await self._rpc.call(member, keyspace.DHT_FETCH, FetchAsk(tuple(page)), timeout_s=COMPARE_S)
             good = [record for record in answer.records if self._may_keep(record, member)]
             await asyncio.gather(*(self._keep(record) for record in good))
             done += len(good)
@@ -452,10 +423,7 @@ class Comparing:
 
     async def close(self) -> None:
         """Give up what waits."""
-        tasks = tuple(self._waking)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._waking.close()
 
 
 _HAND_OVER_S = 2.0
@@ -524,7 +492,7 @@ class HandOver:
         ask = StoreAsk(record)
         try:
             await asyncio.gather(
-                *(self._rpc.call(each, "dht_store", ask, Found, timeout_s=_HAND_OVER_S) for each in replicas)
+                *(self._rpc.call(each, keyspace.DHT_STORE, ask, timeout_s=_HAND_OVER_S) for each in replicas)
             )
         except SwiftbotError as error:
             log.warning("a copy that belongs elsewhere is kept", key=record.key, reason=str(error))
@@ -535,7 +503,7 @@ class HandOver:
 LOSS_S = 0.5
 """How long a lost member's keys wait for all who may have something newer of them. With the writes that follow, which
 wait `replica_timeout_s` for the same silent member, its tasks are taken over within a second of its loss being noticed.
-Whoever has not told by then is asked again at once, and what it has is news."""
+The one that has not told by then is asked again at once, and what it has is news."""
 _AGAIN_S = 1.0
 """After a member could not be compared with."""
 _SOON_S = 0.1
@@ -543,7 +511,7 @@ _SOON_S = 0.1
 _TRIES = 3
 """Comparisons with a new ring before this gateway goes on without a member that is seen but does not answer."""
 _ARRIVAL_S = (0.1, 0.3)
-"""Before whoever has come is compared with, drawn: it is given to find its own records first, and the others do not all
+"""Before a newcomer is compared with, drawn: it is given to find its own records first, and the others do not all
 ask it at one moment. Several that come at once are one step."""
 _ARRIVALS = 500.0
 """And longer by one second for so many members: the more there are, the more come at once."""
@@ -558,7 +526,7 @@ class _Done(NamedTuple):
 
 
 class Reconciler:
-    """Keeps one gateway's shard in step with the others'."""
+    """Keeps one gateway's shard in step with the others'; publishes `RingChanged` when it has compared it."""
 
     def __init__(
         self,
@@ -570,14 +538,18 @@ class Reconciler:
         membership: Membership,
         dht: Dht,
         pulse: StallDetector,
+        events: FleetEvents,
     ) -> None:
         self._config = config
         self._rpc = rpc
         self._membership = membership
+        self._events = events
         self._dht = dht
         self._pulse = pulse
         self._steps = Steps(gateway, replicas=config.replicas)
-        self._comparing = Comparing(config, gateway=gateway, store=store, rpc=rpc, membership=membership, keep=dht.keep)
+        self._comparing = Comparing(
+            config, gateway=gateway, store=store, rpc=rpc, membership=membership, events=events, keep=dht.keep
+        )
         self._hand_over = HandOver(config, gateway=gateway, store=store, rpc=rpc, membership=membership)
         self._changed = asyncio.Event()
         self._hurry = asyncio.Event()
@@ -587,17 +559,26 @@ class Reconciler:
         self._lost_at: float | None = None
         """When the first member was lost that the shard is not settled without."""
         self._running: asyncio.Task[None] | None = None
-        self._wanted = asyncio.Event()
-        """A request waits for the shard to be reconciled."""
-        dht.settling.on_wanted = self._wanted.set
-        membership.on_joined.append(self._on_joined)
-        membership.on_lost.append(self._on_lost)
-        pulse.on_stalled.append(self._on_stalled)
+        events.subscribe(Stage.RECORDS, self._on_event)
 
     def start(self) -> None:
         """Reconcile now, at every change of membership, and every `anti_entropy_s`."""
         self._changed.set()
         self._running = asyncio.create_task(self._run(), name="reconcile")
+
+    def _on_event(self, event: FleetEvent) -> None:
+        match event:
+            case Joined(name):
+                self._on_joined(name)
+            case Lost(name):
+                self._on_lost(name)
+            case Relinked():
+                self._changed.set()
+            case Stalled():
+                self._changed.set()
+                self._hurry.set()
+            case _:
+                pass
 
     def _on_joined(self, name: str) -> None:
         if self._steps.met(name):
@@ -613,16 +594,12 @@ class Reconciler:
         self._changed.set()
         self._hurry.set()
 
-    def _on_stalled(self, _: Stall) -> None:
-        self._changed.set()
-        self._hurry.set()
-
     async def _run(self) -> None:
         while True:
             try:
                 await self._step_by_step()
             except Exception as error:  # supervision boundary: a gateway that never compares again loses records
-                log.exception("reconciling broke off and begins anew")
+                log.exception("reconciling broke off and starts over")
                 self._rpc.refuse("reconciling broke off", reason=f"{type(error).__name__}: {error}")
             await asyncio.sleep(_AGAIN_S)
 
@@ -637,7 +614,7 @@ class Reconciler:
             self._changed.clear()
             self._hurry.clear()
             if not self._dht.settling.returned:
-                self._wanted.clear()
+                self._dht.settling.wanted.clear()
             step = self._steps.next(settled, self._membership.ring, self._pulse.stalls)
             if step.kind is StepKind.ARRIVAL and not waited:
                 await self._let_arrive(step)
@@ -667,7 +644,7 @@ class Reconciler:
                 wait_s, tidy = rest_s if done.heard and handed else _AGAIN_S, False
                 if done.fetched:
                     # A member that could not be asked when the ring changed was heard only now: same news.
-                    self._tell(self._dht.on_ring_change)
+                    self._events.publish(RingChanged())
                 continue
             tries += 1
             if not done.heard and tries < _TRIES and step.kind is not StepKind.LOSS:
@@ -682,7 +659,7 @@ class Reconciler:
     async def _let_arrive(self, step: Step) -> None:
         """Wait a moment for more that come, unless somebody waits for what they bring, or is lost."""
         for_s = random.uniform(*_ARRIVAL_S) + len(step.ring.members) / _ARRIVALS  # noqa: S311 - spreads load
-        waits = [asyncio.create_task(each.wait()) for each in (self._hurry, self._wanted)]
+        waits = [asyncio.create_task(each.wait()) for each in (self._hurry, self._dht.settling.wanted)]
         try:
             await asyncio.wait(waits, timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -743,15 +720,8 @@ class Reconciler:
             "shard settled", why=str(step.kind), members=len(step.ring.members), asked=len(step.asked),
             heard=done.heard, fetched=done.fetched, **fields,
         )  # fmt: skip
-        self._tell(self._dht.on_ring_change)
+        self._events.publish(RingChanged())
         return settled
-
-    def _tell(self, callbacks: list[Callable[[], None]]) -> None:
-        for callback in tuple(callbacks):
-            try:
-                callback()
-            except Exception:  # supervision boundary: one listener's defect must not stop the repair
-                log.exception("a listener to the ring failed")
 
     async def join(self) -> None:
         """Fetch what this gateway will own before it shows itself, so that its first requests wait less.

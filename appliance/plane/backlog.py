@@ -16,6 +16,8 @@ import msgspec
 from msgspec import Struct
 
 from appliance.errors import PayloadError
+from appliance.model import keyspace
+from appliance.model.keys import fleet_and_rest
 
 NUMBERS = 2**32 - 1
 """Numbers go from 1 to this and begin again: Zenoh has 32 bits for them, and 0 is none."""
@@ -73,9 +75,11 @@ def moved(number: int, by: int) -> int:
 @lru_cache(4096)
 def kind_of(key: str) -> str:
     """The kind of a key, without fleet and names: `gw/*/log`, `robot/*/mavlink/*`, `operator/act/*`."""
-    chunks = key.split("/")[2:]
-    kept = (0, 1) if chunks[:1] == ["operator"] else (0, 2)
-    return "/".join(chunk if index in kept else "*" for index, chunk in enumerate(chunks)) or key
+    topic = keyspace.topic_of(key)
+    if topic is not None:
+        return topic.kind
+    fleet, rest = fleet_and_rest(key)
+    return f"{rest.partition('/')[0]}/**" if fleet else key
 
 
 class Backlog:
@@ -105,16 +109,22 @@ class Backlog:
     def say(self, key: str, at_ns: int, payload: bytes, encoding: str, *, deleted: bool = False) -> int:
         """Number a put that is made now; returns its number."""
         with self._lock:
-            for unsent in self._unsent:
-                self._gone(kind_of(unsent), at_ns, self._next())
-            self._unsent.clear()
+            if self._unsent:
+                for unsent in self._unsent:
+                    self._older.append((kind_of(unsent), at_ns, self._next()))
+                self._unsent.clear()
             number = self._next()
-            if self._most_bytes:
-                self._kept.append(Said(number, key, at_ns, payload, encoding, deleted))
-                self._bytes += len(payload) + _ENTRY_BYTES
-                self._forget(at_ns)
-            else:
-                self._gone(kind_of(key), at_ns, number)
+            if not self._most_bytes:
+                self._older.append((kind_of(key), at_ns, number))
+                return number
+            kept = self._kept
+            kept.append(Said(number, key, at_ns, payload, encoding, deleted))
+            self._bytes += len(payload) + _ENTRY_BYTES
+            # What is too old or too much goes.
+            while kept and (self._bytes > self._most_bytes or at_ns - kept[0].at_ns > self._keep_ns):
+                old = kept.popleft()
+                self._bytes -= len(old.payload) + _ENTRY_BYTES
+                self._older.append((kind_of(old.key), old.at_ns, old.number))
         return number
 
     def not_sent(self, key: str) -> None:
@@ -161,14 +171,3 @@ class Backlog:
     def _next(self) -> int:
         self._last = self._last % NUMBERS + 1
         return self._last
-
-    def _forget(self, now_ns: int) -> None:
-        """Let go of what is too old or too much; under the lock."""
-        kept = self._kept
-        while kept and (self._bytes > self._most_bytes or now_ns - kept[0].at_ns > self._keep_ns):
-            old = kept.popleft()
-            self._bytes -= len(old.payload) + _ENTRY_BYTES
-            self._gone(kind_of(old.key), old.at_ns, old.number)
-
-    def _gone(self, kind: str, at_ns: int, number: int) -> None:
-        self._older.append((kind, at_ns, number))

@@ -1,4 +1,4 @@
-"""Deduplication: what is told more than once under one id, such as by both sides of a partition, is heard once."""
+"""Deduplication: what is sent more than once under one id, such as by both sides of a partition, is heard once."""
 
 from collections import OrderedDict
 

@@ -12,7 +12,7 @@ membership differ for a moment, or a partition) make concurrent versions, which 
   be compared, and which did not answer; and members that are *gone*, where all holders of a key were lost together:
   copies are for r-1 of them. They may be on the other side of a cut, or late for their leases on a machine that
   starves, and have the record all the same. What is gone counts for `GONE_S`; by then it is taken for lost, with what
-  only it had. Until then whoever asks for such a key is told that nobody knows.
+  only it had. Until then the one that asks for such a key gets `unreachable`.
 - `Pushing`: replication, a record's copies on their way to its replicas: with a write, and again to one that was too
   slow.
 - `Ordering`: writes as the owner orders them, one after the other.
@@ -28,26 +28,33 @@ import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from functools import partial
-from typing import Annotated, Any
+from typing import Any
 
 import structlog
-from msgspec import Meta, Struct
 
+from appliance.background import Background
 from appliance.errors import ConflictError, DeadlineError, PayloadError, RefusedError, SwiftbotError, UnreachableError
-from appliance.model import VersionVector
+from appliance.model import VersionVector, keyspace
+from appliance.model.plane_api import (
+    Copy,
+    Found,
+    KeyAsk,
+    Listed,
+    Record,
+    RecordAsk,
+    RecordChange,
+    RecordList,
+    RecordPlace,
+    RecordsAsk,
+    StoreAsk,
+    Write,
+    Written,
+)
 from appliance.plane.membership import Membership, StallDetector
 from appliance.plane.records import (
     MAX_KEY,
     Behind,
-    Found,
-    KeyAsk,
-    Record,
-    RecordAsk,
-    RecordChange,
     Resolver,
-    StoreAsk,
-    Write,
-    Written,
     by_bytes,
     check_key,
     check_record,
@@ -78,8 +85,8 @@ class Settling:
     def __init__(
         self, *, gateway: str, membership: Membership, pulse: StallDetector, replicas: int, virtual_nodes: int
     ) -> None:
-        self.on_wanted: Callable[[], None] = lambda: None
-        """Called when a request waits for the shard to be reconciled."""
+        self.wanted = asyncio.Event()
+        """A request waits for the shard to be reconciled; the reconciler clears it."""
         self.returned: frozenset[str] = frozenset()
         """Members that were away and have come back, with whom the shard is not compared yet: on the other side of a
         cut they may have ordered writes."""
@@ -123,11 +130,11 @@ class Settling:
 
         Returns:
             Whether it has; False after `SETTLE_S` at most: then it goes on with what it has. False too as soon as the
-            shard is reconciled with a ring in which the key is another's: whoever asked has to ask there.
+            shard is reconciled with a ring in which the key is another's: the one that asked has to ask there.
         """
         if self.mine(key):
             return True
-        self.on_wanted()
+        self.wanted.set()
 
         def compared() -> bool:
             return self._compared(key) or self._given_away(key)
@@ -158,7 +165,7 @@ class Settling:
 
     async def until_met(self) -> None:
         """Wait a moment until it has: in a large fleet somebody always has just come."""
-        self.on_wanted()
+        self.wanted.set()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(RETURNED_S), self._changed:
                 await self._changed.wait_for(self.met)
@@ -214,7 +221,7 @@ class Absence:
             self._rings = (*doubtful, ring)[-_MOST_RINGS:]
 
     def doubt(self, key: str, now: float) -> tuple[str, ...]:
-        """Gateways that may have a record of a key and were not heard; none: whoever may have it has told."""
+        """Gateways that may have a record of a key and were not heard; none: all that may have it have answered."""
         if self.silent:
             return tuple(sorted(self.silent))
         gone = {name for name, until in self._gone.items() if until > now}
@@ -271,12 +278,12 @@ class Pushing:
         self._rpc = rpc
         self._membership = membership
         self._keep = keep
-        self._pushes: set[asyncio.Task[None]] = set()
+        self._pushes = Background()
 
     def begin(self, gateway: str, record: Record, *, durable: bool = True) -> "Push":
         """Send a replica a record to store; what comes of it is awaited afterwards."""
         ask, timeout_s = StoreAsk(record, durable), self._config.replica_timeout_s
-        call = self._rpc.begin(gateway, "dht_store", ask, Found, timeout_s=timeout_s, direct=True)
+        call = self._rpc.begin(gateway, keyspace.DHT_STORE, ask, timeout_s=timeout_s, direct=True)
         return Push(call, partial(self._heard, gateway, record))
 
     async def push(self, gateway: str, record: Record, *, durable: bool = True) -> Record | None:
@@ -302,12 +309,10 @@ class Pushing:
             log.error("a replica cannot store", replica=gateway, key=record.key, reason=str(error))
 
     def _later(self, push: Coroutine[Any, Any, None]) -> None:
-        if len(self._pushes) >= _MOST_PUSHED:
+        if self._pushes.count >= _MOST_PUSHED:
             push.close()  # anti-entropy will find it
             return
-        task = asyncio.create_task(push)
-        self._pushes.add(task)
-        task.add_done_callback(self._pushes.discard)
+        self._pushes.start(push, "copies of records")
 
     async def _push_again(self, gateway: str, key: str) -> None:
         for wait_s in _PUSH_AGAIN_S:
@@ -316,16 +321,14 @@ class Pushing:
             if record is None or gateway not in self._membership.members:
                 return
             with contextlib.suppress(SwiftbotError):
-                answer = await self._rpc.call(gateway, "dht_store", StoreAsk(record), Found, timeout_s=_PUSH_S)
+                answer = await self._rpc.call(gateway, keyspace.DHT_STORE, StoreAsk(record), timeout_s=_PUSH_S)
                 if answer.record is not None:
                     await self._keep(answer.record)
                 return
 
     async def close(self) -> None:
         """Give up what is on its way."""
-        for task in self._pushes:
-            task.cancel()
-        await asyncio.gather(*self._pushes, return_exceptions=True)
+        await self._pushes.close()
 
 
 _MOST_REMEMBERED = 4096
@@ -336,7 +339,7 @@ class Acknowledged:
     """The writes that this gateway ordered last, by their ids.
 
     A writer whose answer was lost asks again with the same id. While its write is the newest the record itself tells;
-    once another has followed it, only whoever ordered it knows that it is done, and a writer that heard of a conflict
+    once another has followed it, only its orderer knows that it is done, and a writer that heard of a conflict
     would do it a second time.
     """
 
@@ -355,7 +358,7 @@ class Acknowledged:
             self._known.popitem(last=False)
 
     def failed(self, key: str, write: str) -> None:
-        """It was not acknowledged: asked again, it is looked at anew."""
+        """It was not acknowledged: asked again, it is looked at again."""
         self._known.pop((key, write), None)
 
     def of(self, key: str, write: str) -> tuple[bool, VersionVector | None]:
@@ -391,7 +394,7 @@ class Ordering:
         self._unsaved: set[str] = set()
         """Keys whose last decision here the replicas may have and the disk has not."""
         self._acknowledged = Acknowledged()
-        rpc.register("dht_write", Write, self.order, exchange=False)
+        rpc.register(keyspace.DHT_WRITE, self.order)
 
     async def order(self, asked: Write) -> Written:
         """Order a write as the owner of its key, and have the replicas follow.
@@ -493,7 +496,7 @@ class Ordering:
         """Those of what replicas hold in place of a record that this gateway has not itself decided upon it since.
 
         A later decision may overtake it on the way, one sent directly, the other by the sender's queue: then this write
-        is in what the replica holds, and done. A writer that was told of a conflict would do it a second time.
+        is in what the replica holds, and done. A writer that got a conflict would do it a second time.
         """
         known: list[Record | None] = []
 
@@ -516,7 +519,7 @@ class Ordering:
         async def ask(gateway: str) -> None:
             with contextlib.suppress(SwiftbotError):
                 found = await self._rpc.call(
-                    gateway, "dht_read", KeyAsk(key), Found, timeout_s=self._config.replica_timeout_s
+                    gateway, keyspace.DHT_READ, KeyAsk(key), timeout_s=self._config.replica_timeout_s
                 )
                 if found.record is not None:
                     await self._keep(found.record)
@@ -541,7 +544,7 @@ _MOST_NAMED = 5
 
 
 class Dht:
-    """The replicated records as one gateway sees them."""
+    """The replicated records as one gateway sees them. `resolver`: merges versions that were made apart."""
 
     def __init__(
         self,
@@ -552,9 +555,9 @@ class Dht:
         rpc: Rpc,
         membership: Membership,
         pulse: StallDetector,
+        resolver: Resolver = by_bytes,
     ) -> None:
-        self.resolver: Resolver | None = None
-        self.on_ring_change: list[Callable[[], None]] = []
+        self._resolver = resolver
         self._config = config
         self._gateway = gateway
         self._store = store
@@ -571,10 +574,10 @@ class Dht:
             config, gateway=gateway, store=store, rpc=rpc, membership=membership, settling=self.settling, pulse=pulse,
             pushing=self._pushing, keep=self.keep,
         )  # fmt: skip
-        rpc.register("dht_read", KeyAsk, self._on_read, exchange=False)
-        rpc.register("dht_store", StoreAsk, self._on_store, exchange=False)
-        rpc.register("record_read", RecordAsk, self._on_record_read, exchange=False)
-        rpc.register("record_write", RecordChange, self._on_record_write, exchange=False)
+        rpc.register(keyspace.DHT_READ, self._on_read)
+        rpc.register(keyspace.DHT_STORE, self._on_store)
+        rpc.register(keyspace.RECORD_READ, self._on_record_read)
+        rpc.register(keyspace.RECORD_WRITE, self._on_record_write)
 
     # --- the door ---------------------------------------------------------------------------------------------
 
@@ -587,7 +590,7 @@ class Dht:
         `replica`: as this gateway has it if it holds a copy, else as any of those that do; it may be behind.
 
         Raises:
-            UnreachableError: whoever answered has none, and others may have one.
+            UnreachableError: the one that answered has none, and others may have one.
         """
         check_key(key)
         loop = asyncio.get_running_loop()
@@ -601,6 +604,11 @@ class Dht:
                     f"whether there is a record {key} is not known: {found.unsure}", remedy="try again in a second"
                 )
             await asyncio.sleep(_RETRY_S)
+
+    async def removed(self, key: str) -> bool:
+        """Whether a record was removed, as far as those that hold its key remember; False too where none ever was."""
+        found, _ = await self._ask_holders(check_key(key), replica=False)
+        return found.record is not None and found.record.deleted
 
     async def _ask_holders(self, key: str, *, replica: bool) -> tuple[Found, bool]:
         """Ask the holders of a key one after the other, until one has it or knows that there is none.
@@ -620,7 +628,7 @@ class Dht:
                     found = await (self._copy(key) if replica else self._on_read(KeyAsk(key)))
                 else:
                     found = await self._rpc.call(
-                        gateway, "dht_read", KeyAsk(key), Found, timeout_s=_ATTEMPT_S, direct=True
+                        gateway, keyspace.DHT_READ, KeyAsk(key), timeout_s=_ATTEMPT_S, direct=True
                     )
             except SwiftbotError as error:
                 # Away, late, or with a disk that fails: the others have copies.
@@ -686,7 +694,7 @@ class Dht:
                 owner = self._membership.ring.owner(asked.key)
                 if owner == self._gateway:
                     return (await self.ordering.order(asked)).version
-                answer = await self._rpc.call(owner, "dht_write", asked, Written, timeout_s=_ATTEMPT_S, direct=True)
+                answer = await self._rpc.call(owner, keyspace.DHT_WRITE, asked, timeout_s=_ATTEMPT_S, direct=True)
             except (UnreachableError, DeadlineError, RefusedError) as error:
                 # Dead, not yet known to be; or of another mind about who owns the key: both pass.
                 if loop.time() > until:
@@ -716,7 +724,7 @@ class Dht:
         return Found(unsure=unsure)
 
     async def _copy(self, key: str) -> Found:
-        """The copy that is here, whoever the owner is."""
+        """The copy that is here, regardless of the owner."""
         record = await self._store.record(key)
         return Found(record) if record is not None else await self._on_read(KeyAsk(key))
 
@@ -727,8 +735,7 @@ class Dht:
 
     async def keep(self, record: Record) -> Record:
         """Store what stands of a version from elsewhere and the one here; returns it."""
-        resolver = self.resolver or by_bytes
-        kept = await self._store.change(record.key, partial(_settle, record, resolver))
+        kept = await self._store.change(record.key, partial(_settle, record, self._resolver))
         return record if kept is None else kept
 
     async def _on_record_read(self, asked: RecordAsk) -> Found:
@@ -754,59 +761,7 @@ def _settle(other: Record, resolver: Resolver, mine: Record | None) -> Record:
     return settle(mine, other, resolver)
 
 
-MOST_LISTED = 1000
 _BROWSE_S = 1.0
-
-
-class RecordsAsk(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """`records`: which records does this gateway hold copies of, in order of keys after `after`?"""
-
-    prefix: str = ""
-    after: str = ""
-    limit: Annotated[int, Meta(ge=1, le=MOST_LISTED)] = MOST_LISTED
-
-
-class Copy(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A copy of a record as one gateway has it; `problem`: why that is not known."""
-
-    gateway: str
-    version: VersionVector = {}
-    """Empty: it has none."""
-    deleted: bool = False
-    size_bytes: int = 0
-    digest: str = ""
-    """Of version and value; equal copies have equal ones."""
-    problem: str = ""
-
-
-class Listed(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A record and the copy of it that a gateway holds, with where it belongs as that gateway sees the ring."""
-
-    key: str
-    copy: Copy
-    owner: str = ""
-    replicas: tuple[str, ...] = ()
-
-
-class RecordList(Struct, frozen=True, omit_defaults=True):
-    """Answer: in order of keys; `more` when it was cut."""
-
-    records: tuple[Listed, ...] = ()
-    more: bool = False
-
-
-class RecordPlace(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Answer of `record_place`: where a record belongs, and what lies there."""
-
-    key: str
-    owner: str
-    replicas: tuple[str, ...]
-    copies: tuple[Copy, ...] = ()
-
-    @property
-    def agree(self) -> bool:
-        """Whether all replicas answer and hold the same."""
-        return len({each.digest for each in self.copies}) == 1 and not any(each.problem for each in self.copies)
 
 
 class Browsing:
@@ -818,8 +773,8 @@ class Browsing:
         self._store = store
         self._rpc = rpc
         self._membership = membership
-        rpc.register("records", RecordsAsk, self._on_records, exchange=False)
-        rpc.register("record_place", KeyAsk, self._on_place, exchange=False)
+        rpc.register(keyspace.RECORDS, self._on_records)
+        rpc.register(keyspace.RECORD_PLACE, self._on_place)
 
     async def _on_records(self, asked: RecordsAsk) -> RecordList:
         if len(asked.prefix) > MAX_KEY or len(asked.after) > MAX_KEY:
@@ -844,14 +799,14 @@ class Browsing:
             if gateway == self._gateway:
                 record = await self._store.record(asked.key)
             else:
-                record = (await self._rpc.call(gateway, "dht_read", asked, Found, timeout_s=_BROWSE_S)).record
+                record = (await self._rpc.call(gateway, keyspace.DHT_READ, asked, timeout_s=_BROWSE_S)).record
         except SwiftbotError as error:
             return Copy(gateway=gateway, problem=error.message)
         return copy_of(gateway, record)
 
 
 def copy_of(gateway: str, record: Record | None) -> Copy:
-    """What is told of a gateway's copy of a record."""
+    """What is listed of a gateway's copy of a record."""
     if record is None:
         return Copy(gateway=gateway)
     return Copy(

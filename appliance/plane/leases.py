@@ -1,4 +1,4 @@
-"""Leases that a majority grants: mutual exclusion for whoever must not be two, in a fleet that may be cut in two.
+"""Leases that a majority grants: mutual exclusion for work that one alone may do, in a fleet that may be cut in two.
 
 Each key has r grantors, the first on the ring of all gateways that `plane.voters` names, whether they are there or
 not; a lease needs the grant of a majority of them, and any two majorities have one in common.
@@ -20,63 +20,25 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
 import structlog
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from appliance.errors import ConfigError, ConflictError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.model import keyspace
+from appliance.model.keys import Q, R, Verb
+from appliance.model.plane_api import LONGEST_S, Granted, LeaseAsk, LeaseEnd, Released
 from appliance.plane.records import check_key
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
 
-LONGEST_S = 30.0
-"""Longest lease, seconds; for so long a restarted grantor grants nothing, since it has forgotten its grants."""
 MOST_GRANTS = 10_000
 """Live grants of one grantor."""
 _MOST_JUMP = 2**32
 """A fence further ahead than that is no asker's: it would use up the numbers."""
-
-Fence = Annotated[int, Meta(ge=1, le=2**53)]
-
-
-class LeaseAsk(Struct, frozen=True, kw_only=True):
-    """`lease_grant`: grant the holder this key for so long, under this fence."""
-
-    key: str
-    holder: Annotated[str, Meta(min_length=1, max_length=120)]
-    """One acquisition, not one gateway: two tasks of one gateway exclude each other too."""
-    fence: Fence
-    ttl_s: Annotated[float, Meta(gt=0, le=LONGEST_S)]
-    voters: str
-    """Digest of the grantors as the asker is configured."""
-
-
-class LeaseEnd(Struct, frozen=True, kw_only=True):
-    """`lease_release`: the holder needs the grant of this fence no longer."""
-
-    key: str
-    holder: Annotated[str, Meta(min_length=1, max_length=120)]
-    fence: Fence
-    voters: str
-
-
-class Granted(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A grantor's answer."""
-
-    granted: bool = False
-    fence: Annotated[int, Meta(ge=0, le=2**53)] = 0
-    """The highest fence that it has granted, for any key; only a higher one is granted."""
-    holder: str = ""
-    """Where not granted: who has the grant; empty: nobody, the fence was too low."""
-    left_s: float = 0.0
-    """For how much longer."""
-
-
-class Released(Struct, frozen=True):
-    """Answer of `lease_release`: the grant is gone, or was no more."""
 
 
 class Grant(Struct, frozen=True):
@@ -102,7 +64,7 @@ class Grantor:
         self._grants: dict[str, Grant] = {}
 
     def grant(self, asked: LeaseAsk, now: float) -> Granted:
-        """Grant a key, anew or again to its holder, unless another has it or the fence is not higher than any before.
+        """Grant a key, also again to its holder, unless another has it or the fence is not higher than any before.
 
         Raises:
             RefusedError: it was restarted less than the longest lease ago, or holds too many grants.
@@ -174,7 +136,8 @@ def holder_of(answers: Sequence[Granted], grantors: int) -> tuple[str, float] | 
 
 log = structlog.get_logger(__name__)
 
-_FENCE = "lease-fence"
+FENCE = "lease-fence"
+"""Of the store: the highest fence that was granted."""
 _LOST = "lease-lost"
 _ASK_S = 1.0
 """One question to a grantor; all are asked at once, and a majority of answers is enough."""
@@ -220,15 +183,15 @@ class Leases:
         self._grantor: Grantor | None = None
         self._highest = 0
         """Highest fence heard of."""
-        rpc.register("lease_grant", LeaseAsk, self.on_grant, exchange=False)
-        rpc.register("lease_release", LeaseEnd, self.on_release, exchange=False)
+        rpc.register(keyspace.LEASE_GRANT, self.on_grant)
+        rpc.register(keyspace.LEASE_RELEASE, self.on_release)
 
     async def start(self, *, lost: bool) -> None:
         """Begin to grant. `lost`: the store's file could not be read, and with it went the highest fence."""
         if lost:
             await self._store.put(_LOST, b"1")
         if await self._store.get(_LOST) is None:
-            fence = int(await self._store.get(_FENCE) or 0)
+            fence = int(await self._store.get(FENCE) or 0)
             self._grantor = Grantor(fence=fence, now=time.monotonic())
         elif self._gateway in self._config.voters:
             log.error(
@@ -276,7 +239,7 @@ class Leases:
             UnreachableError: fewer than a majority of the key's grantors answer, or grant it.
         """
         if not lease.left_s:
-            raise ConflictError(f"the lease on {lease.key} has ended", remedy="acquire it anew")
+            raise ConflictError(f"the lease on {lease.key} has ended", remedy="acquire it again")
         until = time.monotonic() + min(_TRY_S, lease.left_s)
         while True:
             _, renewed, answers = await self._ask(lease.key, lease.holder, ttl_s)
@@ -310,7 +273,7 @@ class Leases:
         def enough(answers: list[Granted]) -> bool:
             return granted(answers, len(grantors)) or holder_of(answers, len(grantors)) is not None
 
-        answers = await self._poll(grantors, "lease_grant", ask, Granted, self.on_grant, enough)
+        answers = await self._poll(grantors, keyspace.LEASE_GRANT, ask, self.on_grant, enough)
         self._highest = highest(self._highest, answers)
         if not granted(answers, len(grantors)) or until <= _holder_clock():
             return ask.fence, None, answers
@@ -330,29 +293,28 @@ class Leases:
 
     async def _end(self, key: str, holder: str, fence: int) -> None:
         end = LeaseEnd(key=key, holder=holder, fence=fence, voters=self.digest)
-        await self._poll(self.grantors(key), "lease_release", end, Released, self.on_release, lambda _: False)
+        await self._poll(self.grantors(key), keyspace.LEASE_RELEASE, end, self.on_release, lambda _: False)
 
     async def _poll(
         self,
         grantors: tuple[str, ...],
-        verb: str,
-        ask: Asked,
-        kind: type[Answer],
-        here: Callable[[Asked], Awaitable[Answer]],
-        enough: Callable[[list[Answer]], bool],
-    ) -> list[Answer]:
+        verb: Verb[Q, R],
+        ask: Q,
+        here: Callable[[Q], Awaitable[R]],
+        enough: Callable[[list[R]], bool],
+    ) -> list[R]:
         """Ask all grantors at once; returns the answers as soon as they are enough, or when no more will come."""
 
-        async def one(grantor: str) -> Answer | None:
+        async def one(grantor: str) -> R | None:
             try:
                 if grantor == self._gateway:
                     return await here(ask)
-                return await self._rpc.call(grantor, verb, ask, kind, timeout_s=_ASK_S)
+                return await self._rpc.call(grantor, verb, ask, timeout_s=_ASK_S)
             except SwiftbotError as error:
-                log.debug("a grantor does not answer", grantor=grantor, verb=verb, reason=str(error))
+                log.debug("a grantor does not answer", grantor=grantor, verb=verb.name, reason=str(error))
                 return None
 
-        answers: list[Answer] = []
+        answers: list[R] = []
         waiting = {asyncio.create_task(one(grantor)) for grantor in grantors}
         try:
             while waiting and not enough(answers):
@@ -370,7 +332,7 @@ class Leases:
         grantor = self._granting(asked)
         answer = grantor.grant(asked, time.monotonic())
         if answer.granted:
-            await self._store.put(_FENCE, str(grantor.fence).encode())
+            await self._store.put(FENCE, str(grantor.fence).encode())
         return answer
 
     async def on_release(self, ended: LeaseEnd) -> Released:
@@ -381,7 +343,7 @@ class Leases:
     def _granting(self, asked: LeaseAsk | LeaseEnd) -> Grantor:
         if asked.voters != self.digest:
             raise RefusedError(
-                f"{self._gateway} is told other voters than whoever asks",
+                f"{self._gateway} is configured with other voters than the asking gateway",
                 remedy="plane.voters, replicas and virtual_nodes must be the same at every gateway",
             )
         if self._gateway not in self.grantors(asked.key):

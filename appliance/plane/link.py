@@ -4,13 +4,13 @@
 callbacks, answers and errors have. What Zenoh 1.10 does not do right, or has no setting for, is worked round here:
 
 **Which of two gateways dials.** Where each dials the other there are two links, one made by either side, and both carry
-one Zenoh transport. When one side stands still for a lease the other closes both and begins anew; the one that runs
+one Zenoh transport. When one side stands still for a lease the other closes both and starts over; the one that runs
 again notices the ends of its two links one after the other, and in between takes the new link for a further one of the
 old transport. From then on the two mean different keys by the same numbers (zenoh issue 1886): questions arrive at
 wrong doors or nowhere, for as long as that link lives. In a fleet of eight with two links between each pair some
 gateway did not answer another after fourteen of 23 standstills; with one link between each pair all did after each of
 72 (docs/benchmarks.md). With one link this cannot happen: Zenoh takes one incoming link of a transport and no more, so
-that whoever dials anew is refused until the old link's end has been noticed, and with that link the old transport is
+that a new dial is refused until the old link's end has been noticed, and with that link the old transport is
 gone.
 
 So each gateway has a rank, and the higher one dials. A gateway that is named in the others' `plane.peers` has a rank by
@@ -20,23 +20,25 @@ session id dials, and the id ends with the rank. (Zenoh compares ids from their 
 
 **When a socket is given up.** When a link breaks while its send buffer is full, Zenoh waits for the kernel to give the
 socket up before it forgets what it knew of the other side; by default that takes the kernel a quarter of an hour. If
-the two meet again before, one side goes on with what it knew and the other begins anew, with the same end. With
+the two meet again before, one side goes on with what it knew and the other starts over, with the same end. With
 TCP_USER_TIMEOUT (tcp(7)), which `SocketWatch` sets from outside, the kernel gives up after the lease, when Zenoh takes
 the other side for dead as well.
 """
 # pyright: reportUnknownMemberType=false
 
 import asyncio
+import base64
 import contextlib
 import ipaddress
 import os
 import secrets
 import socket
 import stat
+import time
 from collections.abc import Callable, Mapping, Set
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 from urllib.parse import urlsplit
 
 import msgspec
@@ -45,7 +47,10 @@ import zenoh
 
 from appliance.errors import ConfigError, DeadlineError, SwiftbotError, UnreachableError, from_code
 from appliance.model import ErrorReply, encode
-from appliance.plane.settings import PlaneConfig
+from appliance.plane.settings import AUTHENTICATED, PlaneConfig
+
+if TYPE_CHECKING:
+    from appliance.identity.credentials import Credentials
 
 _RANK_BYTES = 4
 _ID_BYTES = 16
@@ -154,7 +159,7 @@ class SocketWatch:
     def shut(self, ends: Set[tuple[Address, Address]]) -> int:
         """Break the TCP connections with these (local, remote) ends and no others; returns how many.
 
-        Zenoh makes its links anew at once.
+        Zenoh reopens its links at once.
         """
         with contextlib.suppress(OSError):
             self.look()
@@ -223,10 +228,10 @@ _WIRE_HEADROOM = 8
 """Zenoh itself drops messages of more than so many times the largest payload, before they are whole in memory."""
 
 
-def open_raw(config: PlaneConfig, gateway: str = "") -> zenoh.Session:
+def open_raw(config: PlaneConfig, gateway: str = "", credentials: "Credentials | None" = None) -> zenoh.Session:
     """Open a session, that of a gateway where it is named; blocks. Errors as `Session.open`."""
     try:
-        return zenoh.open(_zenoh_config(config, gateway))
+        return zenoh.open(_zenoh_config(config, gateway, credentials))
     except zenoh.ZError as error:
         raise _open_error(config, str(error)) from error
 
@@ -277,15 +282,30 @@ WRONG_DOOR = "the question is not for this"
 NOBODY_REMEDY = "is that gateway or robot up and linked?"
 
 
-def mark(key: str, *, direct: bool) -> bytes:
-    """The attachment of a question: for which key it is."""
-    return (MARK if direct else b"") + key.encode()
+SIGNED = b"\0"
+"""Between the key in an attachment and the signature: no key has such a byte."""
 
 
-def read_mark(query: zenoh.Query) -> tuple[bool, bytes]:
-    """Whether a question is direct, and the key it is for; empty where it does not say."""
+class Mark(NamedTuple):
+    """What a question says of itself in its attachment."""
+
+    direct: bool
+    meant: bytes
+    """The key it is for; empty where it does not say."""
+    signature: bytes
+    """Who asks (`identity.signing`); empty where it is not signed."""
+
+
+def mark(key: str, *, direct: bool, signature: bytes = b"") -> bytes:
+    """The attachment of a question: for which key it is, and by whom."""
+    return (MARK if direct else b"") + key.encode() + (SIGNED + signature if signature else b"")
+
+
+def read_mark(query: zenoh.Query) -> Mark:
+    """What a question says of itself."""
     raw = query.attachment.to_bytes() if query.attachment is not None else b""
-    return raw.startswith(MARK), raw.removeprefix(MARK)
+    meant, _, signature = raw.removeprefix(MARK).partition(SIGNED)
+    return Mark(raw.startswith(MARK), meant, signature)
 
 
 def asker_of(query: zenoh.Query) -> str:
@@ -331,7 +351,46 @@ def error_from(text: bytes) -> SwiftbotError:
     return rebuilt
 
 
-def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
+def read_credentials(config: PlaneConfig, fleet: str, kept: Path | None = None) -> "Credentials | None":
+    """The keys of a process as configured, None without; blocks. IdentityError where they are not good."""
+    if not config.keys:
+        return None
+    # Imported by those that have keys only: it takes 60 ms.
+    from appliance.identity.credentials import Credentials  # noqa: PLC0415
+
+    keys = Path(config.keys).expanduser()
+    return Credentials.load(keys, config.roster_file, fleet=fleet, now=time.time(), kept=kept)
+
+
+def _security(config: PlaneConfig, credentials: "Credentials") -> dict[str, Any]:
+    """Zenoh's settings for links on which both sides prove who they are, and are held to their roles."""
+    from appliance.identity import access  # noqa: PLC0415 - as above
+
+    opened = credentials.open()
+    bundle, fleet = opened.bundle, credentials.identity.fleet
+    made = (
+        access.rules(fleet, robots=opened.robots, barred=opened.barred)
+        if config.listen
+        else access.dialling_rules(fleet)
+    )
+    # Not the file: it may be another's by the time that Zenoh reads it, and each certificate in a file of authorities
+    # is taken for one.
+    key, certificate, authority = (base64.b64encode(each).decode() for each in bundle.parts())
+    return {
+        "transport/link/protocols": sorted(AUTHENTICATED),
+        "transport/link/tls/enable_mtls": True,
+        "transport/link/tls/root_ca_certificate_base64": authority,
+        "transport/link/tls/listen_certificate_base64": certificate,
+        "transport/link/tls/listen_private_key_base64": key,
+        "transport/link/tls/connect_certificate_base64": certificate,
+        "transport/link/tls/connect_private_key_base64": key,
+        "transport/link/tls/verify_name_on_connect": True,
+        "transport/link/tls/close_link_on_expiration": True,
+        "access_control": access.zenoh_settings(made),
+    }
+
+
+def _zenoh_config(config: PlaneConfig, gateway: str, credentials: "Credentials | None" = None) -> zenoh.Config:
     """Zenoh's own configuration; design/platform has the measurements behind it."""
     client = config.mode == "client"
     settings: dict[str, Any] = {
@@ -361,7 +420,7 @@ def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
         # A peer that takes nothing for a lease is as good as dead: its link is closed and the sender goes on.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": config.lease_ms * 1000,
         # Direct questions and their answers have a priority of their own, and room for a burst of them; a full link
-        # holds up whoever sends one for so long at most, in microseconds.
+        # holds up the one that sends one for so long at most, in microseconds.
         "transport/link/tx/queue/size/data_high": 16,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
         "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": config.lease_ms * 1000,
@@ -380,6 +439,8 @@ def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
             # Gossip names addresses where the table may have host names: a gateway would dial by both, and, linked by
             # one, be refused by the other again and again for as long as the link lives.
             settings["scouting/gossip/autoconnect"] = {"router": [], "peer": [], "client": []}
+    if credentials is not None:
+        settings |= _security(config, credentials)
     made = zenoh.Config()
     for key, value in settings.items():
         made.insert_json5(key, msgspec.json.encode(value).decode())
@@ -388,7 +449,7 @@ def _zenoh_config(config: PlaneConfig, gateway: str) -> zenoh.Config:
 
 def _open_error(config: PlaneConfig, text: str) -> SwiftbotError:
     for endpoint in config.listen:
-        if f"bound to {endpoint}" in text or endpoint in text:
+        if endpoint.partition("/")[2] in text:
             if "in use" in text:
                 return ConfigError(
                     f"cannot listen on {endpoint}: the port is in use",
@@ -403,10 +464,12 @@ def _open_error(config: PlaneConfig, text: str) -> SwiftbotError:
                 return ConfigError(f"cannot listen on {endpoint}: not permitted", remedy="use a port above 1023")
             return ConfigError(f"cannot listen on {endpoint}: {_first(text)}", remedy="correct plane.listen")
     if config.mode == "client":
-        return UnreachableError(
-            f"nothing answers at {', '.join(config.connect)}",
-            remedy="start a gateway (`swiftbot gateway`), or name the endpoint of one with --connect",
-        )
+        remedy = "start a gateway (`swiftbot gateway`), or name the endpoint of one with --connect"
+        if config.keys:
+            remedy += "; that gateway's certificate must name the host that is dialled (`swiftbot keys show FILE`)"
+        elif any(each.partition("/")[0] == "tcp" for each in config.connect):
+            remedy += "; one with keys answers on tls/ and asks for yours (--keys)"
+        return UnreachableError(f"nothing answers at {', '.join(config.connect)}", remedy=remedy)
     return ConfigError(
         f"the Zenoh session cannot be opened: {_first(text)}", remedy="check plane.listen, plane.connect, plane.peers"
     )

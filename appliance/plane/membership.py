@@ -1,20 +1,25 @@
 """Membership and failure detection: which gateways are there, and when one cannot trust what it sees of them.
 
 A gateway is there while its liveliness token is seen; the ring is made of those. A token goes when its process dies (at
-once) or its link has been silent for a lease, so nobody is asked. When a link is cut and made anew while the other end
-stands still, Zenoh may forget a token that is there and never mention it again; whoever hears from a gateway that it is
+once) or its link has been silent for a lease, so nobody is asked. When a link is cut and reopened while the other end
+stands still, Zenoh may forget a token that is there and never mention it again; who hears from a gateway that it is
 not seen shows a further token, and is there while any of them is (`Membership`).
+
+**Who is a gateway.** Where there are keys, a token alone makes no member. A session that may show tokens could show any
+number of them under any names, and each would own a part of the ring. So a gateway is asked first, at its own key, to
+sign something new with its certificate, and belongs to the ring once that has its name and is neither expired nor
+revoked. It is asked again when the roster changes.
 
 **Stalls** (`StallDetector`): this process was frozen, suspended with its machine, or starved of the processor. A
 gateway that stands still for a lease is taken for dead and succeeded, and does not know it: when it runs again it
 first finds the requests that waited for it, and would order writes that its successor has ordered since, from records
-that are stale. So after a stall it orders no write for a lease (whoever asked asks again, at the right gateway by
+that are stale. So after a stall it orders no write for a lease (the one that asked asks again, at the right gateway by
 then), and compares its shard with the others' before it answers as an owner.
 
-**Stale links** (`Outlived`): links that outlive a stall and must not, and those that do not come back, are made anew.
+**Stale links** (`Outlived`): links that outlive a stall and must not, and those that do not come back, are reopened.
 All others close their links with a process that stands still for a lease, and dial again. When it runs again it may
 take a new connection before it has noticed that the old one is closed. Zenoh 1.10 then goes on with what it knew of
-the other side, which has begun anew: questions arrive at wrong doors there, answers nowhere, and neither side sees
+the other side, which has started over: questions arrive at wrong doors there, answers nowhere, and neither side sees
 the other's facts, for as long as that link lives (zenoh issue 1886). It shows here, by no word of anybody:
 
 - this process stood still for a lease,
@@ -24,7 +29,7 @@ the other's facts, for as long as that link lives (zenoh issue 1886). It shows h
 
 Or the two never link again: each took the other's new connection for one that it had already, dropped it, and dials no
 more, though each is named in the other's `connect`. Then a member that was there before is lost for good, while others,
-which have come back, see it. Links that are made anew have it told of by those at their other ends, and dialled.
+which have come back, see it. Links that are reopened have it told of by those at their other ends, and dialled.
 
 **Duplicate ids** (`Namesakes`): another gateway with this one's id, met after both have joined, since they began at one
 moment or a cut has healed. Who joins asks whether its name is free; that tells nothing of one that cannot be seen just
@@ -39,15 +44,16 @@ import contextlib
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterable, Set
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import msgspec
 import structlog
-from msgspec import Struct
 
-from appliance.errors import ConfigError, PayloadError, SwiftbotError
-from appliance.model import ContainerInfo, GatewayStatus, RobotInfo, encode
-from appliance.plane.keys import check_name
+from appliance.errors import ConfigError, IdentityError, PayloadError, SwiftbotError
+from appliance.model import GatewayStatus, encode, keyspace
+from appliance.model.keys import check_name
+from appliance.model.plane_api import Facts, FactsAsk
+from appliance.plane.events import FleetEvent, FleetEvents, Joined, Lost, Stage, Stall, Stalled
 from appliance.plane.ring import Ring
 from appliance.plane.session import Closer, Session
 
@@ -59,19 +65,14 @@ def clock() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
-class Stall(NamedTuple):
-    """When a process stood still: since what moment of `clock`, and for how many seconds."""
-
-    since: float
-    lasted_s: float
-
-
 class StallDetector:
-    """Beats on a thread of its own: what only holds up the event loop makes nobody take this gateway for dead."""
+    """Beats on a thread of its own: what only holds up the event loop makes nobody take this gateway for dead.
 
-    def __init__(self, lease_s: float, *, clock: Callable[[], float] = clock) -> None:
-        self.on_stalled: list[Callable[[Stall], None]] = []
-        """Called on the event loop after the process stood still, once for each standstill and told which."""
+    Publishes `Stalled` once for each stall.
+    """
+
+    def __init__(self, lease_s: float, *, events: FleetEvents, clock: Callable[[], float] = clock) -> None:
+        self._events = events
         self._lease_s = lease_s
         self._clock = clock
         self._lock = threading.Lock()
@@ -105,7 +106,7 @@ class StallDetector:
             self._beat()
 
     def _beat(self) -> float:
-        """Look at the clock, from any thread; whoever does so first after a stall finds it."""
+        """Look at the clock, from any thread; the one that does so first after a stall finds it."""
         with self._lock:
             now = self._clock()
             since, stood_s, self._last = self._last, now - self._last, now
@@ -119,12 +120,8 @@ class StallDetector:
             # The loop may be gone when the process ends without closing: then nobody listens.
             with contextlib.suppress(RuntimeError):
                 if self._loop is not None:
-                    self._loop.call_soon_threadsafe(self._tell, Stall(since, stood_s))
+                    self._loop.call_soon_threadsafe(self._events.publish, Stalled(Stall(since, stood_s)))
         return now
-
-    def _tell(self, standstill: Stall) -> None:
-        for callback in tuple(self.on_stalled):
-            callback(standstill)
 
     def close(self) -> None:
         """Beat no more."""
@@ -134,6 +131,12 @@ class StallDetector:
             self._thread = None
 
 
+PROVE_AGAIN_S = (0.5, 30.0)
+"""After a gateway has not proved who it is, while its token is there: first so long, doubled up to that."""
+LATE_S = 2.0
+"""The longest such pause for one that has not answered: it may just be busy, and is needed in the ring."""
+Prove = Callable[[str], Awaitable[None]]
+"""Has a gateway prove that it is the one of that id: IdentityError when it is not, another when it does not say."""
 MOST_MEMBERS = 1000
 """Gateways known at once; liveliness of more costs too much (design/platform). More are refused and counted."""
 _MOST_TOKENS = 8
@@ -141,16 +144,30 @@ _MOST_TOKENS = 8
 
 
 class Membership:
-    """The gateways of a fleet as this process sees them. `gateway` is this one's id; None for clients."""
+    """The gateways of a fleet as this process sees them; publishes `Joined` and `Lost`.
 
-    def __init__(self, session: Session, *, gateway: str | None, virtual_nodes: int) -> None:
+    `gateway` is this one's id; None for clients. `prove`: asked before another counts; None: tokens do.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        gateway: str | None,
+        virtual_nodes: int,
+        events: FleetEvents,
+        prove: Prove | None = None,
+    ) -> None:
+        self._prove = prove
+        self._candidates: dict[str, set[str]] = {}
+        """Those whose token is seen and who have not proved who they are -> keys of their tokens."""
+        self._proving: dict[str, asyncio.Task[None]] = {}
         self._session = session
         self._gateway = gateway
         self._members: frozenset[str] = frozenset() if gateway is None else frozenset({gateway})
         self._made = self._members, Ring(self._members, virtual_nodes=virtual_nodes)
         """The members that the ring was last made of, and it."""
-        self.on_joined: list[Callable[[str], None]] = []
-        self.on_lost: list[Callable[[str], None]] = []
+        self._events = events
         self._tokens: dict[str, set[str]] = {}
         """Name -> keys of the tokens seen."""
         self._since: dict[str, float] = {}
@@ -195,29 +212,107 @@ class Membership:
     def start(self) -> None:
         """Begin to watch."""
         keys = self._session.keys
-        self._watches = [self._session.watch_alive(each, self._seen) for each in (keys.alive(), keys.alive_again())]
+        self._watches = [
+            self._session.watch_alive(each, self._seen)
+            for each in (keys(keyspace.GATEWAY_ALIVE), keys(keyspace.GATEWAY_ALIVE_AGAIN))
+        ]
 
-    def add(self, name: str) -> None:
-        """Count a gateway in before its token is watched."""
-        self._seen(self._session.keys.alive(name), alive=True)
+    def add(self, key: str) -> None:
+        """Count a gateway in by the key of its token, before tokens are watched."""
+        self._seen(key, alive=True)
 
     def join(self) -> None:
         """Show the others that this gateway is there."""
         if self._gateway is not None:
-            self._token = self._session.declare_alive(self._session.keys.alive(self._gateway))
+            self._token = self._session.declare_alive(self._session.keys(keyspace.GATEWAY_ALIVE, self._gateway))
 
     def show_again(self) -> None:
         """Show a token that nobody can have forgotten: somebody does not see the first."""
         if self._gateway is None or self._token is None:
             return
         self._shown += 1
-        before, again = self._again, self._session.keys.alive_again(self._gateway, str(self._shown))
+        before, again = self._again, self._session.keys(keyspace.GATEWAY_ALIVE_AGAIN, self._gateway, str(self._shown))
         self._again = self._session.declare_alive(again)
         if before is not None:
             before.close()
 
     def _seen(self, key: str, alive: bool) -> None:
-        name = key.removeprefix(f"{self._session.keys.root}/gw/").partition("/")[0]
+        # A stranger's token may be on any expression that matches ours: it has no name, and is refused below.
+        name, *_ = keyspace.GATEWAY_ALIVE.match(key) or keyspace.GATEWAY_ALIVE_AGAIN.match(key) or ("",)
+        if self._prove is not None and name not in (*self._members, self._gateway):
+            self._seen_candidate(self._prove, name, key, alive)
+        else:
+            self._counted(name, key, alive)
+
+    def _seen_candidate(self, prove: Prove, name: str, key: str, alive: bool) -> None:
+        """Note a token of one that has not proved who it is."""
+        tokens = self._candidates.get(name)
+        if alive and tokens is None:
+            if len(self._candidates) >= MOST_MEMBERS:
+                self._session.refuse("too many gateways", key=key)
+                return
+            self._candidates[name] = {key}
+            self._proving[name] = asyncio.create_task(self._have_proved(prove, name), name=f"is it {name}")
+        elif alive and tokens is not None and len(tokens) < _MOST_TOKENS:
+            tokens.add(key)
+        elif not alive and tokens is not None:
+            tokens.discard(key)
+            if not tokens:
+                self._forget_candidate(name)
+
+    def _forget_candidate(self, name: str) -> set[str]:
+        task = self._proving.pop(name, None)
+        if task is not None and task is not asyncio.current_task():
+            task.cancel()
+        return self._candidates.pop(name, set())
+
+    async def _have_proved(self, prove: Prove, name: str) -> None:
+        """Count a gateway in once it has proved who it is, for as long as a token of it is there."""
+        pause_s, longest_s = PROVE_AGAIN_S
+        while True:
+            try:
+                await prove(name)
+            except SwiftbotError as error:
+                self._session.refuse("token without a gateway", member=name, reason=str(error))
+                if not isinstance(error, IdentityError):
+                    pause_s = min(LATE_S, pause_s)
+                await asyncio.sleep(pause_s)
+                pause_s = min(longest_s, pause_s * 2)
+                continue
+            for key in sorted(self._forget_candidate(name)):
+                self._counted(name, key, alive=True)
+            return
+
+    async def proved(self, timeout_s: float) -> None:
+        """Wait until those whose tokens were seen have proved who they are, or did not for so long."""
+        if self._proving:
+            await asyncio.wait(tuple(self._proving.values()), timeout=timeout_s)
+
+    async def prove_again(self) -> None:
+        """Have all members prove once more who they are; those that turn out to be others are lost.
+
+        One that does not answer just now stays: its token says whether it is there.
+        """
+        if (prove := self._prove) is None:
+            return
+        at_once = asyncio.Semaphore(MOST_ASKED)
+
+        async def again(name: str) -> None:
+            try:
+                async with at_once:
+                    await prove(name)
+            except IdentityError as error:
+                log.warning("a member is no gateway of the fleet any more", member=name, reason=str(error))
+                for key in tuple(self._tokens.get(name, ())):
+                    self._counted(name, key, alive=False)
+                    self._seen_candidate(prove, name, key, alive=True)
+            except SwiftbotError as error:
+                log.info("a member did not prove who it is", member=name, reason=str(error))
+
+        # At once: one that is silent must not delay that a revoked one is lost.
+        await asyncio.gather(*(again(name) for name in sorted(self._members - {self._gateway})))
+
+    def _counted(self, name: str, key: str, alive: bool) -> None:
         if name == self._gateway or not self._count(name, key, alive):
             return
         try:
@@ -238,14 +333,7 @@ class Membership:
                 del self._gone[next(iter(self._gone))]
         self._members = self._members | {name} if alive else self._members - {name}
         log.info("gateway joined" if alive else "gateway lost", member=name, members=len(self._members))
-        self._tell(self.on_joined if alive else self.on_lost, name)
-
-    def _tell(self, listeners: list[Callable[[str], None]], name: str) -> None:
-        for callback in tuple(listeners):
-            try:
-                callback(name)
-            except Exception:  # supervision boundary: the other listeners must hear of it all the same
-                log.exception("a listener to the membership failed", member=name)
+        self._events.publish(Joined(name) if alive else Lost(name))
 
     def _count(self, name: str, key: str, alive: bool) -> bool:
         """Note a token's coming or going; returns whether its gateway comes or goes with it."""
@@ -265,6 +353,8 @@ class Membership:
 
     def close(self) -> None:
         """Leave: the token is taken back first, so the others take over before this gateway stops answering."""
+        for name in tuple(self._candidates):
+            self._forget_candidate(name)
         for closer in (self._again, self._token, *self._watches):
             if closer is not None:
                 closer.close()
@@ -278,10 +368,10 @@ ANSWER_LEASES = 2.0
 BACK_LEASES = 2.0
 """Leases after which those that were lost must have come back: of each two one dials again every 0.2 s."""
 RELINK_REST_S = 30.0
-"""Least time between two such looks: where a machine starves, links made anew are more work and no help. A standstill
+"""Least time between two such looks: where a machine starves, links reopened are more work and no help. A standstill
 within it is looked at once it is over."""
 RELINK_TRIES = 3
-"""Times that links are made anew after one standstill."""
+"""Times that links are reopened after one standstill."""
 WITNESSES = 3
 """Members that are asked whether one that has not come back is there."""
 MOST_ASKED = 32
@@ -309,19 +399,19 @@ class Outlived:
     """Looks, after each standstill, for members that should have been lost and were not.
 
     Args:
-        pulse: tells of standstills.
+        events: publishes stalls.
         lease_s: of the links.
         members: who is there.
         answers: asks a member something; whether it answered within so many seconds.
         sees: asks a member whether it sees another; False as well where it does not answer within so many seconds.
-        renew: makes all links anew; told why.
+        renew: reopens all links; told why.
         now: the pulse's clock.
         pause: waits so many seconds.
     """
 
     def __init__(
         self,
-        pulse: StallDetector,
+        events: FleetEvents,
         *,
         lease_s: float,
         members: Members,
@@ -331,7 +421,6 @@ class Outlived:
         now: Callable[[], float] = clock,
         pause: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
-        self._pulse = pulse
         self._lease_s = lease_s
         self._members = members
         self._answers = answers
@@ -341,23 +430,27 @@ class Outlived:
         self._pause = pause
         self._looking: asyncio.Task[None] | None = None
         self._not_before = 0.0
-        pulse.on_stalled.append(self._on_stalled)
+        self._unsubscribe = events.subscribe(Stage.LINKS, self._on_event)
 
-    def _on_stalled(self, standstill: Stall) -> None:
+    def _on_event(self, event: FleetEvent) -> None:
+        if isinstance(event, Stalled):
+            self._on_stalled(event.stall)
+
+    def _on_stalled(self, stall: Stall) -> None:
         # After less than a lease the others may not have closed their links at all.
-        if standstill.lasted_s < self._lease_s:
+        if stall.lasted_s < self._lease_s:
             return
         if self._looking is not None and not self._looking.done():
             return  # with long leases a look lasts longer than the rest after it
         wait_s = max(0.0, self._not_before - self._now())
         self._not_before = self._now() + wait_s + RELINK_REST_S
-        self._looking = asyncio.create_task(self._look(standstill.since, wait_s), name="links after a standstill")
+        self._looking = asyncio.create_task(self._look(stall.since, wait_s), name="links after a standstill")
 
     async def _look(self, since: float, wait_s: float) -> None:
         if wait_s:
             await self._pause(wait_s)
         await self._pause(self._lease_s * PAUSE_LEASES)
-        # Links that were made anew can be mixed up again: then all are asked.
+        # Links that were reopened can be mixed up again: then all are asked.
         for number in range(RELINK_TRIES):
             if silent := await (self._mute() if number else self._silent(since)):
                 log.warning("members do not answer after a standstill", members=silent)
@@ -366,7 +459,7 @@ class Outlived:
             if apart := await self._apart(since):
                 log.warning("members that were lost in a standstill are there and do not come back", members=apart)
                 self._renew("others see members that did not come back")
-                # They link anew just then: none is silent for that reason.
+                # They link again just then: none is silent for that reason.
                 await self._pause(self._lease_s * PAUSE_LEASES)
             if not silent and not apart:
                 return
@@ -404,40 +497,11 @@ class Outlived:
         return [name for name, told in zip(lost, seen, strict=True) if any(told) and name in still]
 
     async def close(self) -> None:
-        """Look no more, whatever the pulse tells until it is closed too; more than once does no harm."""
-        if self._on_stalled in self._pulse.on_stalled:
-            self._pulse.on_stalled.remove(self._on_stalled)
+        """Stop looking, though stalls may still be published; more than once does no harm."""
+        self._unsubscribe()
         if self._looking is not None:
             self._looking.cancel()
             await asyncio.gather(self._looking, return_exceptions=True)
-
-
-class FactsAsk(Struct, frozen=True, omit_defaults=True):
-    """`facts`: what do you know? `all`: of the other gateways too, of those whose ids come after `after`."""
-
-    all: bool = False
-    after: str = ""
-
-
-class Known(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a gateway knows of another, and how old that is."""
-
-    gateway: str
-    status: GatewayStatus | None = None
-    containers: tuple[ContainerInfo, ...] = ()
-    age_ms: int = 0
-
-
-class Facts(Struct, frozen=True, omit_defaults=True):
-    """A gateway's own facts, the robots it knows of, and, if asked, what it knows of other gateways."""
-
-    gateway: str
-    status: GatewayStatus | None = None
-    containers: tuple[ContainerInfo, ...] = ()
-    robots: tuple[RobotInfo, ...] = ()
-    others: tuple[Known, ...] = ()
-    more: bool = False
-    """There are further others."""
 
 
 NAMESAKE_STATUSES = 3
@@ -525,7 +589,7 @@ class Namesakes:
         self._asking = None
 
     async def _ask(self) -> None:
-        key, ask = self._session.keys.rpc(self._gateway, "facts"), encode(FactsAsk())
+        key, ask = self._session.keys(keyspace.RPC, self._gateway, "facts"), encode(FactsAsk())
         try:
             answers = await self._session.query_all(key, ask, timeout_s=_NAMESAKE_ASK_S)
         except SwiftbotError as error:

@@ -1,6 +1,6 @@
-"""What takes part in the plane: a gateway (`Plane`), a client (`PlaneClient`) and a router (`run_router`).
+"""What takes part in the plane: a gateway (`Plane`) and a router (`run_router`); a client's part is in `client`.
 
-A gateway's part is session, RPC, membership, records, leases and registry put together; a client asks any gateway.
+A gateway's part is session, RPC, membership, records, leases and registry put together.
 
 A router is what a large fleet's gateways are clients of, so that they need no links with each other. A few gateways
 link as peers, each with each. Beyond some thirty that costs too much memory and descriptors; there, three to five
@@ -13,32 +13,44 @@ addressed by key and the routers find the way, so any of them can be restarted a
 import asyncio
 import contextlib
 import math
-import random
 import time
-from collections.abc import Callable, Set
+from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import structlog
-from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import ConfigError, DeadlineError, SwiftbotError, UnreachableError
+from appliance.errors import ConfigError, DeadlineError, IdentityError, SwiftbotError, UnreachableError
+from appliance.model import keyspace
+from appliance.model.keys import Keys, check_name
+from appliance.model.plane_api import Member, MemberAsk
+from appliance.model.roles import Role
 from appliance.plane.anti_entropy import Reconciler
 from appliance.plane.dht import Browsing, Dht
-from appliance.plane.keys import Keys, check_name
+from appliance.plane.events import FleetEvent, FleetEvents, RingChanged, Stage
 from appliance.plane.leases import Leases
 from appliance.plane.link import dialled
 from appliance.plane.membership import Membership, Outlived, StallDetector, displaced
+from appliance.plane.proofs import Proofs
+from appliance.plane.records import Resolver, by_bytes
 from appliance.plane.registry import Registry
+from appliance.plane.reopening import Reopener
 from appliance.plane.ring import Ring
+from appliance.plane.rosters import Rosters
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
 
+if TYPE_CHECKING:
+    from appliance.identity.credentials import Credentials
+
 log = structlog.get_logger(__name__)
 
 STORE_FILE = "gateway.sqlite"
+ROSTER_FILE = "roster.json"
+"""The roster that counts, beside the store."""
 
 
 AWAY_S = 60.0
@@ -50,39 +62,48 @@ Somebody who is seen and does not answer must not hold it up."""
 GIVE_S = 10.0
 """How long one that has to go gives its records away: thousands, where the others answer."""
 UNSEEN_S = 10.0
-"""After so long those that `plane.peers` names and that have not come are told of, once."""
+"""After so long those that `plane.peers` names and that have not come are reported, once."""
+ROSTER_S = 5.0
+"""How often it is looked whether the roster has changed."""
 MOST_ASKED = 3
 ASK_TIMEOUT_S = 0.5
 """One that is busy for longer is no help: what is linked directly counts then."""
 
 
-class MemberAsk(Struct, frozen=True):
-    """`member`: do you see a gateway of this name?"""
-
-    gateway: str
-
-
-class Member(Struct, frozen=True):
-    """The answer."""
-
-    here: bool
-
-
 class Plane:
     """A gateway's membership in the fleet; made by `open`, ended by `close`."""
 
-    def __init__(self, config: PlaneConfig, *, session: Session, store: Store, gateway: str) -> None:
+    def __init__(
+        self, config: PlaneConfig, *, session: Session, store: Store, gateway: str, resolver: Resolver = by_bytes
+    ) -> None:
         self.config = config
         self.gateway = gateway
         self.session = session
         self.store = store
         self.keys: Keys = session.keys
         self.rpc = Rpc(session, gateway)
-        self._membership = Membership(session, gateway=gateway, virtual_nodes=config.virtual_nodes)
-        self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=gateway)
-        self._pulse = StallDetector(config.lease_ms / 1e3)
+        self.events = FleetEvents()
+        proofs = self._proofs = (
+            None
+            if session.credentials is None
+            else Proofs(
+                session.credentials, rpc=self.rpc, keys=self.keys, gateway=gateway, within_s=config.lease_ms / 1e3
+            )
+        )
+        self._membership = Membership(
+            session,
+            gateway=gateway,
+            virtual_nodes=config.virtual_nodes,
+            events=self.events,
+            prove=None if proofs is None else proofs.prove,
+        )
+        self._proving: asyncio.Task[None] | None = None
+        self.registry = Registry(
+            config, session=session, rpc=self.rpc, membership=self._membership, events=self.events, gateway=gateway
+        )
+        self._pulse = StallDetector(config.lease_ms / 1e3, events=self.events)
         self._outlived = Outlived(
-            self._pulse,
+            self.events,
             lease_s=config.lease_ms / 1e3,
             members=self._membership,
             answers=self._answers,
@@ -97,6 +118,7 @@ class Plane:
             rpc=self.rpc,
             membership=self._membership,
             pulse=self._pulse,
+            resolver=resolver,
         )
         Browsing(config, gateway=gateway, store=store, rpc=self.rpc, membership=self._membership)
         self._reconciler = Reconciler(
@@ -107,10 +129,20 @@ class Plane:
             membership=self._membership,
             dht=self.dht,
             pulse=self._pulse,
+            events=self.events,
         )
-        self.rpc.register("member", MemberAsk, self._on_member, exchange=False)
-        self.on_member_joined: list[Callable[[str], None]] = self._membership.on_joined
-        self.on_member_lost: list[Callable[[str], None]] = self._membership.on_lost
+        self.rpc.register(keyspace.MEMBER, self._on_member)
+        self._roster_news = asyncio.Event()
+        self._rosters = Rosters(
+            session.credentials,
+            gateway=gateway,
+            rpc=self.rpc,
+            members=self.members,
+            on_taken=self._roster_news.set,
+        )
+        self.on_revoked: Callable[[frozenset[str]], Awaitable[None]] | None = None
+        """Called with the robots whose certificates a new roster has revoked, before their links are closed."""
+        self._reopener = Reopener(session, gateway=gateway, rpc=self.rpc, members=self.members, events=self.events)
         self.milestones: dict[str, float] = {}
         """When, on this machine's monotonic clock, `session` and `store` were open; `linked` to somebody; `present`: it
         knew who is there; `fetched` what it will own; `joined`: the others can see it; `reconciled`: it answers for its
@@ -119,7 +151,11 @@ class Plane:
         self._back = asyncio.Event()
         self._away_s = 0.0
         """For how long nothing was written here before."""
-        self.dht.on_ring_change.append(lambda: self._reached("reconciled"))
+        self.events.subscribe(Stage.RECORDS, self._on_event)
+
+    def _on_event(self, event: FleetEvent) -> None:
+        if isinstance(event, RingChanged):
+            self._reached("reconciled")
 
     def _reached(self, milestone: str) -> None:
         if milestone in self.milestones:
@@ -135,8 +171,12 @@ class Plane:
             log.info("back in the ring", gateway=self.gateway, members=members, session_opened_s=opened_s, **after_ms)
 
     @classmethod
-    async def open(cls, config: PlaneConfig, *, fleet: str, gateway: str, data_dir: Path) -> "Plane":
+    async def open(
+        cls, config: PlaneConfig, *, fleet: str, gateway: str, data_dir: Path, resolver: Resolver = by_bytes
+    ) -> "Plane":
         """Open the session and the store, fetch what this gateway will own, and join.
+
+        `resolver` merges versions of a record that were made apart; by default one of them stands.
 
         Raises:
             ConfigError: a setting is wrong, an endpoint or the store is in use, the id is taken.
@@ -148,7 +188,7 @@ class Plane:
         session, opened, store = await _open_both(config, fleet, gateway, data_dir / STORE_FILE)
         plane: Plane | None = None
         try:
-            plane = cls(config, session=session, store=store, gateway=gateway)
+            plane = cls(config, session=session, store=store, gateway=gateway, resolver=resolver)
             plane._away_s = away_s
             plane.milestones["session"] = opened
             plane._reached("store")
@@ -195,14 +235,16 @@ class Plane:
         self._reached("linked")
         present = await self._present()
         self._reached("present")
-        # Nobody is told of this gateway before its token shows: it may look for its records meanwhile.
+        # Nobody hears of this gateway before its token shows: it may look for its records meanwhile.
         checking = asyncio.create_task(self._check_free(present), name="is the name free")
         try:
-            for name in present:
-                membership.add(name)
+            for key in present:
+                membership.add(key)
             membership.start()
             self._pulse.start()
             self.registry.start()
+            # Otherwise this gateway would take itself for the first one up.
+            await membership.proved(self.config.lease_ms / 1e3)
             if self._away_s > AWAY_S:
                 await self._reconciler.join()
             self._reached("fetched")
@@ -214,6 +256,45 @@ class Plane:
         self._reconciler.start()
         log.info("joined", gateway=self.gateway, members=sorted(membership.members))
         self._unseen = asyncio.get_running_loop().call_later(UNSEEN_S, self._tell_unseen)
+        if self.session.credentials is not None:
+            self._proving = asyncio.create_task(self._watch_roster(self.session.credentials), name="roster")
+
+    async def _watch_roster(self, credentials: "Credentials") -> None:
+        """Have members prove again who they are whenever the roster changes, and go by what is new of it.
+
+        Ends with the error of a reopening that leaves the gateway without a session; after any other error it goes on.
+        """
+        number, barred = credentials.roster.number, credentials.barred
+        while True:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(ROSTER_S):
+                    await self._roster_news.wait()
+            self._roster_news.clear()
+            try:
+                credentials.refresh()
+                if (found := credentials.roster.number) != number:
+                    log.info("the roster is new", number=found)
+                    # Before the links of a robot are closed: it may be moving.
+                    if (revoked := credentials.barred - barred) and self.on_revoked is not None:
+                        await self.on_revoked(revoked)
+                    barred = credentials.barred
+                    for robot in barred:
+                        self.registry.lose(robot)
+                    await self._membership.prove_again()
+                    # Last: where one of these steps breaks, all are done again.
+                    number = found
+                await self._rosters.spread()
+                if credentials.stale:
+                    await self._reopener.reopen("other keys, or other robots")
+            except Exception:
+                if self.session.gone:
+                    raise
+                log.exception("looking at the roster broke; it goes on")
+
+    async def until_gone(self) -> None:
+        """Wait until the session was closed to be reopened and could not be; raises why. Without keys it returns."""
+        if self._proving is not None:
+            await asyncio.shield(self._proving)
 
     def _tell_unseen(self) -> None:
         """Say which gateways of the table have not come: two that each wait for the other's call are two fleets."""
@@ -237,7 +318,8 @@ class Plane:
     async def _check_free(self, present: list[str]) -> None:
         """Raise ConfigError when another process shows our token; one that was killed may do so for a lease."""
         until = asyncio.get_running_loop().time() + 2 * self.config.lease_ms / 1e3
-        while self.gateway in present or await self._known_to(present):
+        own = self.keys(keyspace.GATEWAY_ALIVE, self.gateway)
+        while own in present or await self._known_to(present):
             if asyncio.get_running_loop().time() > until:
                 raise ConfigError(
                     f"a gateway named {self.gateway} is already in fleet {self.keys.fleet}",
@@ -248,10 +330,11 @@ class Plane:
 
     async def _known_to(self, present: list[str]) -> bool:
         """Whether gateways that are linked already see one of our name to which we have no link yet."""
-        others = [name for name in present if name != self.gateway][:MOST_ASKED]
+        names = [name for key in present for name in keyspace.GATEWAY_ALIVE.match(key) or ()]
+        others = [name for name in names if name != self.gateway][:MOST_ASKED]
         ask = MemberAsk(gateway=self.gateway)
         answers = await asyncio.gather(
-            *(self.rpc.call(name, "member", ask, Member, timeout_s=ASK_TIMEOUT_S) for name in others),
+            *(self.rpc.call(name, keyspace.MEMBER, ask, timeout_s=ASK_TIMEOUT_S) for name in others),
             return_exceptions=True,
         )
         return any(isinstance(answer, Member) and answer.here for answer in answers)
@@ -260,7 +343,7 @@ class Plane:
         """Whether a member answers a question in time, whatever it says."""
         ask = MemberAsk(gateway=self.gateway)
         try:
-            await self.rpc.call(name, "member", ask, Member, timeout_s=timeout_s)
+            await self.rpc.call(name, keyspace.MEMBER, ask, timeout_s=timeout_s)
         except SwiftbotError as error:
             return not isinstance(error, UnreachableError | DeadlineError)
         return True
@@ -269,14 +352,17 @@ class Plane:
         """Whether a member says in time that it sees another."""
         ask = MemberAsk(gateway=other)
         with contextlib.suppress(SwiftbotError):
-            return (await self.rpc.call(name, "member", ask, Member, timeout_s=timeout_s)).here
+            return (await self.rpc.call(name, keyspace.MEMBER, ask, timeout_s=timeout_s)).here
         return False
 
     async def _on_member(self, ask: MemberAsk) -> Member:
-        return Member(here=check_name(ask.gateway, "gateway") in self._membership.members)
+        here = check_name(ask.gateway, "gateway") in self._membership.members
+        proof = self._proofs.proof(ask.challenge) if self._proofs is not None and ask.challenge else b""
+        return Member(here=here, proof=proof)
 
     async def _present(self) -> list[str]:
-        return [key.split("/")[-2] for key in await self.session.alive_now(self.keys.alive())]
+        """Return the keys of all gateways' tokens."""
+        return await self.session.alive_now(self.keys(keyspace.GATEWAY_ALIVE))
 
     @property
     def ring(self) -> Ring:
@@ -299,6 +385,9 @@ class Plane:
         """Leave the fleet and close the store; more than once does no harm."""
         if self._unseen is not None:
             self._unseen.cancel()
+        if self._proving is not None:
+            self._proving.cancel()
+            await asyncio.gather(self._proving, return_exceptions=True)
         await self._outlived.close()
         self._membership.close()
         await self._reconciler.close()
@@ -320,7 +409,7 @@ async def _open_both(config: PlaneConfig, fleet: str, gateway: str, path: Path) 
     """Open session and store at the same time; returns when the session was open too. Errors as `Plane.open`."""
     storing = asyncio.create_task(Store.open(path), name="open the store")
     try:
-        session = await Session.open(config, fleet, gateway)
+        session = await Session.open(config, fleet, gateway, roster=path.with_name(ROSTER_FILE))
     except BaseException:
         with contextlib.suppress(SwiftbotError):
             await (await storing).close()
@@ -333,80 +422,22 @@ async def _open_both(config: PlaneConfig, fleet: str, gateway: str, path: Path) 
         raise
 
 
-class PlaneClient:
-    """Everybody else's connection: command line, terminal UI, recorder, robots. Owns nothing on the ring."""
-
-    def __init__(self, config: PlaneConfig, *, session: Session) -> None:
-        self.config = config
-        self.session = session
-        self.keys: Keys = session.keys
-        self.rpc = Rpc(session, None)
-        self._membership = Membership(session, gateway=None, virtual_nodes=config.virtual_nodes)
-        self.registry = Registry(config, session=session, rpc=self.rpc, membership=self._membership, gateway=None)
-        self._came = asyncio.Event()
-        self._gateway = ""
-
-    @classmethod
-    async def open(cls, config: PlaneConfig, *, fleet: str) -> "PlaneClient":
-        """Connect, and learn who is there and what they know.
-
-        Raises:
-            ConfigError: a setting is wrong.
-            UnreachableError: no endpoint answers.
-        """
-        client = cls(config, session=await Session.open(config, fleet))
-        client._membership.on_joined.append(lambda _: client._came.set())
-        try:
-            client.registry.start()
-            client._membership.start()
-            for key in await client.session.alive_now(client.keys.alive()):
-                client._membership.add(key.split("/")[-2])
-            await client.registry.wait_for_facts()
-        except BaseException:
-            await client.close()
-            raise
-        return client
-
-    @property
-    def ring(self) -> Ring:
-        """The ring of the gateways that are there just now, if they have as many virtual nodes as configured here."""
-        return self._membership.ring
-
-    def members(self) -> frozenset[str]:
-        """Ids of the gateways that are there."""
-        return self._membership.members
-
-    async def any_gateway(self, *, timeout_s: float = 3.0, avoid: Set[str] = frozenset()) -> str:
-        """Return a gateway that is there, the same one while it is; UnreachableError when there is none.
-
-        One to `avoid` is returned only when there is no other.
-        """
-        until = asyncio.get_running_loop().time() + timeout_s
-        while not self.members():
-            self._came.clear()
-            try:
-                async with asyncio.timeout_at(until):
-                    await self._came.wait()
-            except TimeoutError:
-                raise UnreachableError(
-                    f"no gateway of fleet {self.keys.fleet} is there",
-                    remedy=f"is the fleet name right, and is it up? asked at {', '.join(self.config.connect)}",
-                ) from None
-        if self._gateway not in self.members() or self._gateway in avoid:
-            others = sorted(self.members() - avoid) or sorted(self.members())
-            self._gateway = random.choice(others)  # noqa: S311 - spreads load, protects nothing
-        return self._gateway
-
-    async def close(self) -> None:
-        """Disconnect."""
-        self._membership.close()
-        await self.registry.close()
-        await self.session.close()
-
-
 _ROUTER_FLEET = "router"
 """A session belongs to a fleet by the keys it uses; a router uses none, and routes for all fleets."""
 _ROUTER_LOOK_S = 1.0
+
+
+def _fleet_of(keys: str) -> str:
+    """The fleet whose router one with these keys is; IdentityError unless they are for a gateway or router."""
+    from appliance.identity.bundle import Bundle  # noqa: PLC0415 - only those that have keys pay for it
+
+    identity = Bundle.load(Path(keys).expanduser()).identity
+    if identity.role is not Role.GATEWAY:
+        raise IdentityError(
+            f"{keys} is of {identity.text}, and a router accepts links",
+            remedy="swiftbot keys issue gateway NAME --host ADDRESS",
+        )
+    return identity.fleet
 
 
 async def run_router(
@@ -416,10 +447,14 @@ async def run_router(
 
     Raises:
         ConfigError: there is nothing to listen on, or it is in use.
+        IdentityError: its keys are not good, or not those of a gateway.
     """
     if not config.listen:
-        raise ConfigError("a router has nothing to listen on", remedy="give --listen, such as tcp/0.0.0.0:7447")
-    session = await Session.open(replace(config, mode="router"), _ROUTER_FLEET)
+        raise ConfigError("a router has nothing to listen on", remedy="give --listen, such as tls/0.0.0.0:7447")
+    fleet = _ROUTER_FLEET
+    if config.keys:
+        fleet = await asyncio.to_thread(_fleet_of, config.keys)
+    session = await Session.open(replace(config, mode="router"), fleet)
     try:
         log.info("routing", listen=config.listen, connect=config.connect)
         ready(session)

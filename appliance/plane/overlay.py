@@ -19,7 +19,7 @@ asked twice, so a lookup never runs in a circle.
 
 **Upkeep**: joining, meeting neighbours, mending after failures, gossip. A round is one errand: meet a member (swap
 neighbours and a few others, and see that it is there) or look up a finger's position. Neighbours matter most, so
-every other round goes to them; fingers are looked up in turn, and the rest met in turn, whoever was not heard of for
+every other round goes to them; fingers are looked up in turn, and the rest met in turn, those not heard of for
 longest first. When a round finds something changed the next comes sooner, when not, later: at rest a gateway sends a
 few bytes a second, and under churn as much as it takes (`Pace`). Rounds come from `due`, what came of them goes back
 in.
@@ -175,7 +175,7 @@ class View:
     def step(self, target: int, *, named: bool = False) -> Step:
         """What `me` can say of a position: that it is its own, whose it is, or who is closer to it.
 
-        `named`: others take `me` for its owner. Then those before `me` are told if they lie after the position: so
+        `named`: others take `me` for its owner. Then those before `me` hear of it if they lie after the position: so
         many may have joined there that who named it, and even `me`, does not know them all.
         """
         names, delta = self._names, (target - self.origin) % RING_SIZE
@@ -558,7 +558,7 @@ class Upkeep:
         if not len(view):
             return None
         after, before = view.after(), view.before()
-        # Too short a list of neighbours: whoever is last in it knows those beyond.
+        # Too short a list of neighbours: the one that is last in it knows those beyond.
         if self._turn % 4 == 1:
             short = not view.whole and len(after) < view.after_count
             return Meet(after[-1] if short and after else view.names[0])
@@ -606,7 +606,7 @@ class Upkeep:
             self.next_at = min(self.next_at, now + self._pace.least_s)
 
     def unreachable(self, member: str, now: float, *, in_round: bool = True) -> None:
-        """A member is not there: found so in a round, by a lookup, or told by whoever watches for it."""
+        """A member is not there: found so in a round, by a lookup, or told by the one that watches for it."""
         known = self.view.lose(member)
         self._seen.pop(member, None)
         self._late.pop(member, None)
@@ -673,7 +673,7 @@ class Upkeep:
         return tuple(name for name in names if now - self._gone.get(name, -_GONE_S) >= _GONE_S)
 
     def _news(self, new: list[str]) -> bool:
-        """Trim the view, and return whether neighbours are among those heard of: those are told on."""
+        """Trim the view, and return whether neighbours are among those heard of: those are passed on."""
         view = self.view
         view.trim(self._rng)
         if len(self._seen) > 2 * view.bound:

@@ -1,38 +1,24 @@
-"""Records and their version vectors, what becomes of a record when versions meet, and the requests for records.
+"""Records and their version vectors, and what becomes of a record when versions meet.
 
 A write names the version it saw. Versions that do not descend from one another were written without knowledge of
 each other (two owners during a change of membership, or a partition); every gateway picks the same one, and the
 result descends from both, so replicas end up equal in whatever order they hear (design/algorithms, Versions). Pure.
-
-The requests by which gateways exchange records, and by which programs ask any gateway for them, are here as well:
-verbs of docs/keyspace.md.
 """
 
 import hashlib
 from collections.abc import Callable, Mapping
 
 import msgspec
-from msgspec import Struct
 
 from appliance.errors import ConflictError, PayloadError
 from appliance.model import VersionVector
-from appliance.plane.keys import check_name
+from appliance.model.keys import check_name
+from appliance.model.plane_api import Record, Write
 
 MAX_KEY = 512
 """Characters in a record's key."""
 _MAX_WRITERS = 256
 _MAX_COUNT = 2**53
-
-
-class Record(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A replicated record. `deleted` is a tombstone; `write` identifies the write that made it."""
-
-    key: str
-    value: bytes = b""
-    version: VersionVector = {}
-    deleted: bool = False
-    write: str = ""
-    """Id of the last write: a writer that lost the answer and asks again finds its own write done."""
 
 
 Resolver = Callable[[str, Record, Record], Record]
@@ -90,17 +76,6 @@ def settle(mine: Record | None, other: Record, resolver: Resolver) -> Record:
         return other
     winner = resolver(mine.key, mine, other)
     return msgspec.structs.replace(winner, version=merge(mine.version, other.version))
-
-
-class Write(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A wish to change a record, given the version its writer saw (`None`: there must be none)."""
-
-    key: str
-    value: bytes = b""
-    deleted: bool = False
-    expected: VersionVector | None = None
-    write: str = ""
-    durable: bool = True
 
 
 def decide(current: Record | None, asked: Write, gateway: str) -> Record:
@@ -198,52 +173,3 @@ def check_write(asked: Write, *, max_bytes: int) -> Write:
 def _check_size(key: str, value: bytes, most: int) -> None:
     if len(value) > most:
         raise PayloadError(f"the value of {key} has {len(value):,} bytes", remedy=f"at most {most:,}")
-
-
-class KeyAsk(Struct, frozen=True):
-    """`dht_read`: the record of a key, from this gateway's shard."""
-
-    key: str
-
-
-class Found(Struct, frozen=True, omit_defaults=True):
-    """Answer with a record, or that there is none here."""
-
-    record: Record | None = None
-    unsure: str = ""
-    """Where there is none: why there may be one elsewhere. Empty: there is none."""
-    owner: str = ""
-    """Where there is none and the key is another's, as the asked one sees the ring: whose."""
-
-
-class StoreAsk(Struct, frozen=True, omit_defaults=True):
-    """`dht_store`: keep this version, unless a newer one is here."""
-
-    record: Record
-    durable: bool = True
-    """On the disk before the answer; otherwise the last moments may be lost with the power."""
-
-
-class Written(Struct, frozen=True):
-    """`dht_write` done: the version it made."""
-
-    version: VersionVector
-
-
-class RecordAsk(Struct, frozen=True, omit_defaults=True):
-    """`record_read`: a record, from whoever holds it; the answer of `read`, tombstones left out."""
-
-    key: str
-    replica: bool = False
-    """From whichever replica answers first, which may be behind its owner; one that is asked here if it is one."""
-
-
-class RecordChange(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """`record_write`: compare and set, through any gateway."""
-
-    key: str
-    value: bytes = b""
-    deleted: bool = False
-    expected: VersionVector | None = None
-    write: str = ""
-    """An id of the caller's own makes asking again safe; empty: one is made."""

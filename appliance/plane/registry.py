@@ -4,15 +4,15 @@ Owners put facts when they change (`Speaker`). What goes out says how old it is:
 ago, and containers may have changed since they were last told. A status that says nothing new is repeated now and then,
 and says when it will be again at the latest: listeners can tell silence from loss.
 
-Whoever comes later asks: each member of a small fleet; in a large one a neighbour for all that it knows, and then only
+A newcomer asks: each member of a small fleet; in a large one a neighbour for all that it knows, and then only
 those it knew nothing of. A fact carries its age: since it was heard, on this machine's monotonic clock, and what its
 speaker said it was old by then; what is older than its speaker promised is stale, counts less in decisions, and is
 asked for again. What a gateway said goes with it. Robots describe themselves, or their gateways do; one that is gone is
 shown offline for a while (`Roster`).
 
-**How often a thing is told of** (`Cadence`, pure) follows from how volatile it is and how much it is asked for. The
-paper pushes every 500 ms: a container that was taken in between is missed, and one that never changes is told for
-nothing. Here every change is told, and the interval between two messages about one thing weighs what a message costs
+**How often a thing is published** (`Cadence`, pure) follows from how volatile it is and how much it is asked for. The
+paper pushes every 500 ms: a container that was taken in between is missed, and one that never changes is published for
+nothing. Here every change is published, and the interval between messages about one thing weighs what a message costs
 against what it saves. With messages T apart a change is known T/2 late on average, so of `demand` decisions a second
 about demand · volatility · T / 2 rest on a state that has passed, while listeners / T messages a second are delivered.
 The sum, with `DELIVERY_PRICE` such decisions worth a delivery, is least at
@@ -20,7 +20,7 @@ The sum, with `DELIVERY_PRICE` such decisions worth a delivery, is least at
     T = sqrt(2 · DELIVERY_PRICE · listeners / (volatility · demand))
 
 the square-root law of keeping copies fresh (Cho and Garcia-Molina, "Synchronizing a database to improve freshness",
-SIGMOD 2000). A thing that has been quiet for T is told of at once.
+SIGMOD 2000). A thing that has been quiet for T is published at once.
 """
 
 import asyncio
@@ -35,17 +35,19 @@ import structlog
 from msgspec.structs import replace
 
 from appliance.errors import PayloadError, SwiftbotError
-from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode
+from appliance.model import ContainerInfo, ContainerState, GatewayStatus, RobotInfo, encode, keyspace
+from appliance.model.keys import check_name
+from appliance.model.plane_api import Facts, FactsAsk, Known
 from appliance.model.robots import plausible, read_robot
-from appliance.plane.keys import check_name
-from appliance.plane.membership import Facts, FactsAsk, Known, Membership, Namesakes
+from appliance.plane.events import FactsChanged, FleetEvent, FleetEvents, Joined, Lost, Relinked, Stage
+from appliance.plane.membership import Membership, Namesakes
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Message, Session
 from appliance.plane.settings import PlaneConfig
 
 DELIVERY_PRICE = 0.005
 """Decisions on a passed state that the delivery of one message is worth. With three listeners, a container that changes
-twice a second and is asked for once a second is told of at most every 120 ms; at ten times of both, every 20 ms."""
+twice a second and is asked for once a second is published at most every 120 ms; at ten times of both, every 20 ms."""
 RATE_MEMORY_S = 10.0
 """Rates are averages over about so long."""
 QUIET_DEMAND = 0.02
@@ -80,8 +82,8 @@ def interval_s(*, volatility: float, demand: float, listeners: int, least_s: flo
     Args:
         volatility: changes a second.
         demand: decisions a second that rest on it.
-        listeners: who is told.
-        least_s: never less; what changes within this time is told together.
+        listeners: how many hear it.
+        least_s: never less; what changes within this time is published together.
         most_s: never more.
     """
     least_s, most_s = bounds(listeners, least_s=least_s, most_s=most_s)
@@ -102,7 +104,7 @@ def heartbeat_s(listeners: int, least_s: float) -> float:
 
 
 class Cadence:
-    """When one thing is told of next."""
+    """When one thing is published next."""
 
     def __init__(self, *, least_s: float, most_s: float) -> None:
         self._least_s, self._most_s = least_s, most_s
@@ -218,7 +220,7 @@ class Speaker:
         self._plan(now)
 
     def asked(self, image: str, *, here: bool) -> None:
-        """A decision rests on containers of an image; one made `here` is one that the others are told of."""
+        """A decision rests on containers of an image; one made `here` is one that the others hear of."""
         now = time.monotonic()
         self._cadence(image).asked(now)
         self._of_status.asked(now)
@@ -280,18 +282,18 @@ class Speaker:
     def _tell_image(self, image: str) -> None:
         session, gateway = self._session, self._gateway
         for gone in [each.id for each in self._told.values() if each.image == image and each.id not in self._wanted]:
-            session.delete(session.keys.container(gateway, gone))
+            session.delete(session.keys(keyspace.CONTAINER, gateway, gone))
             del self._told[gone]
         for each in self._wanted.values():
             if each.image == image and self._told.get(each.id) != each:
-                session.put(session.keys.container(gateway, each.id), encode(each))
+                session.publish(keyspace.CONTAINER, each, gateway, each.id)
                 self._told[each.id] = each
 
     def _tell_status(self, now: float) -> None:
         if self._status is None:
             return
         self._status_told, self._status_told_at = self._status, now
-        self._session.put(self._session.keys.status(self._gateway), encode(self.now(self._status)))
+        self._session.publish(keyspace.STATUS, self.now(self._status), self._gateway)
 
     def now(self, status: GatewayStatus) -> GatewayStatus:
         """A status as it is said at this moment: with its age, and what is asked for here."""
@@ -299,6 +301,7 @@ class Speaker:
         return replace(
             status,
             age_ms=status.age_ms + round((now - self._status_at) * 1e3),
+            at_ns=time.time_ns(),
             untold_ms=round(self.untold_s * 1e3),
             again_ms=round(self._again_s() * 1e3),
             asked=told_demand({image: rate.read(now) for image, rate in self._decisions.items()}),
@@ -366,10 +369,10 @@ class Roster:
 
     def start(self) -> None:
         """Begin to listen."""
-        session, keys = self._session, self._session.keys
+        session = self._session
         self._closers = [
-            session.subscribe(keys.robot(), self._heard),
-            session.watch_alive(keys.robot_alive(), self._on_alive),
+            session.subscribe(session.keys(keyspace.ROBOT), self._heard),
+            session.watch_alive(session.keys(keyspace.ROBOT_ALIVE), self._on_alive),
         ]
         self._sweeping = asyncio.create_task(self._keep_sweeping(), name="roster")
 
@@ -435,7 +438,7 @@ class Roster:
         return True
 
     def _on_robot(self, key: str, info: RobotInfo | None) -> None:
-        robot = key.split("/")[-2]
+        (robot,) = keyspace.ROBOT.names(key)
         if info is None:
             # Somebody removed its row: a robot that is merely gone is put as offline, or its token ends.
             self._gone.pop(robot, None)
@@ -470,9 +473,10 @@ class Roster:
 
     def _on_alive(self, key: str, alive: bool) -> None:
         if not alive:
-            self._lose(key.split("/")[-2])
+            self.lose(*keyspace.ROBOT_ALIVE.names(key))
 
-    def _lose(self, robot: str) -> None:
+    def lose(self, robot: str) -> None:
+        """Count a robot as offline until it is heard again."""
         info = self.robots.get(robot)
         if info is not None and info.online:
             self.robots[robot] = replace(info, online=False)
@@ -530,19 +534,29 @@ _DOUBT_S = 1.0
 
 
 class Registry:
-    """What is known of the fleet just now. `on_change` gets `gateway`, `container` or `robot`."""
+    """What is known of the fleet just now; publishes `FactsChanged`."""
 
     def __init__(
-        self, config: PlaneConfig, *, session: Session, rpc: Rpc, membership: Membership, gateway: str | None
+        self,
+        config: PlaneConfig,
+        *,
+        session: Session,
+        rpc: Rpc,
+        membership: Membership,
+        events: FleetEvents,
+        gateway: str | None,
     ) -> None:
         self.gateways: dict[str, GatewayStatus] = {}
         self.containers: dict[str, dict[str, ContainerInfo]] = {}
-        self._roster = Roster(session, on_change=lambda: self._tell("robot"))
+        self._roster = Roster(session, on_change=lambda: events.publish(FactsChanged("robot")))
         self.robots: dict[str, RobotInfo] = self._roster.robots
-        self.on_change: list[Callable[[str], None]] = []
+        self.lose = self._roster.lose
+        self.clock_s: dict[str, float] = {}
+        """Gateway -> by how much its clock is ahead of this machine's, seconds, as its last status says it."""
         self._session = session
         self._rpc = rpc
         self._membership = membership
+        self._events = events
         self._gateway = gateway
         self._closers: list[Closer] = []
         self._heard: dict[str, int] = {}
@@ -561,21 +575,20 @@ class Registry:
         """Others that go by this gateway's id."""
         if gateway is not None:
             self.namesakes = Namesakes(session, gateway, own=lambda: self.gateways.get(gateway))
-            rpc.register("facts", FactsAsk, self._on_facts, exchange=False)
+            rpc.register(keyspace.FACTS, self._on_facts)
             self._speaker = Speaker(
                 session, gateway, least_s=config.coalesce_ms / 1e3, most_s=config.coalesce_most_ms / 1e3,
                 listeners=lambda: len(membership.members) - 1, elsewhere=self._asked_elsewhere,
             )  # fmt: skip
-        membership.on_joined.append(self._on_joined)
-        membership.on_lost.append(self._forget)
+        events.subscribe(Stage.FACTS, self._on_event)
 
     def start(self) -> None:
         """Begin to listen."""
-        session, keys = self._session, self._session.keys
+        session = self._session
         self._roster.start()
         self._closers = [
-            session.subscribe_typed(keys.status(), GatewayStatus, self._on_status),
-            session.subscribe_typed(keys.container(), ContainerInfo, self._on_container),
+            session.subscribe_typed(keyspace.STATUS, self._on_status),
+            session.subscribe_typed(keyspace.CONTAINER, self._on_container),
         ]
 
     @property
@@ -595,7 +608,7 @@ class Registry:
         self._as_of[status.id] = time.monotonic() - status.age_ms / 1e3
         if self._speaker is not None:
             self._speaker.status(status)
-        self._tell("gateway")
+        self._events.publish(FactsChanged("gateway"))
 
     def publish_containers(self, containers: tuple[ContainerInfo, ...]) -> None:
         """Tell the fleet which containers this gateway holds: all of them; those left out are gone."""
@@ -603,7 +616,7 @@ class Registry:
             self.containers[self._gateway] = {each.id: each for each in containers}
         if self._speaker is not None:
             self._speaker.containers(containers)
-        self._tell("container")
+        self._events.publish(FactsChanged("container"))
 
     def asked(self, image: str, *, here: bool = True) -> None:
         """Note a decision that rests on containers of an image; `here`: made on this gateway, not for another."""
@@ -687,7 +700,7 @@ class Registry:
             await asyncio.wait(tasks)
 
     def _on_status(self, key: str, status: GatewayStatus | None) -> None:
-        gateway = key.split("/")[-2]
+        (gateway,) = keyspace.STATUS.names(key)
         if gateway == self._gateway and status is not None and self.namesakes is not None:
             self.namesakes.heard(status)
         if gateway == self._gateway or status is None or not self._is_member(gateway):
@@ -696,6 +709,8 @@ class Registry:
             self._session.refuse("misplaced gw/*/status", key=key, says=status.id)
             return
         self._count(gateway)
+        if status.at_ns:
+            self.clock_s[gateway] = (status.at_ns - time.time_ns()) / 1e9
         self._learn_status(gateway, status, age_s=status.age_ms / 1e3)
 
     def _learn_status(self, gateway: str, status: GatewayStatus, *, age_s: float) -> None:
@@ -708,10 +723,10 @@ class Registry:
         self._as_of[gateway] = time.monotonic() - max(0.0, age_s)
         if status.containers <= len(self.containers.get(gateway, ())):
             self._missing.discard(gateway)  # otherwise it has put some of its containers before we listened
-        self._tell("gateway")
+        self._events.publish(FactsChanged("gateway"))
 
     def _on_container(self, key: str, info: ContainerInfo | None) -> None:
-        gateway, container = key.split("/")[-3], key.rsplit("/", maxsplit=1)[-1]
+        gateway, container = keyspace.CONTAINER.names(key)
         if gateway == self._gateway or not self._is_member(gateway):
             return
         held = self.containers.setdefault(gateway, {})
@@ -728,7 +743,7 @@ class Registry:
             held[container] = info
             self._container_as_of[gateway, container] = time.monotonic()
         self._count(gateway)
-        self._tell("container")
+        self._events.publish(FactsChanged("container"))
 
     def _is_member(self, gateway: str) -> bool:
         """Facts of those whose token is not seen are left: they are asked for when it comes."""
@@ -736,6 +751,15 @@ class Registry:
 
     def _count(self, gateway: str) -> None:
         self._heard[gateway] = self._heard.get(gateway, 0) + 1
+
+    def _on_event(self, event: FleetEvent) -> None:
+        match event:
+            case Joined(gateway) | Relinked(gateway):
+                self._on_joined(gateway)
+            case Lost(gateway):
+                self._forget(gateway)
+            case _:
+                pass
 
     def _on_joined(self, gateway: str) -> None:
         """A member has come: what it put before we listened must be asked for, of it or of one that has heard it."""
@@ -776,7 +800,7 @@ class Registry:
             try:
                 while True:
                     ask = FactsAsk(all=True, after=after)
-                    facts = await self._rpc.call(neighbour, "facts", ask, Facts, timeout_s=_FACTS_S)
+                    facts = await self._rpc.call(neighbour, keyspace.FACTS, ask, timeout_s=_FACTS_S)
                     self._roster.take(facts.robots)
                     if not after and self._is_member(neighbour):
                         self._take(neighbour, facts)
@@ -812,7 +836,7 @@ class Registry:
         for attempt in range(_FACTS_TRIES):
             heard = self._heard.get(gateway, 0)
             try:
-                facts = await self._rpc.call(gateway, "facts", FactsAsk(), Facts, timeout_s=_FACTS_S)
+                facts = await self._rpc.call(gateway, keyspace.FACTS, FactsAsk(), timeout_s=_FACTS_S)
             except SwiftbotError as error:
                 log.info("facts could not be had", member=gateway, reason=str(error))
                 await asyncio.sleep(0.1)
@@ -840,7 +864,7 @@ class Registry:
             for each in containers[:MOST_CONTAINERS]
             if each.gateway == gateway and each.state is not ContainerState.DEAD
         }
-        self._tell("container")
+        self._events.publish(FactsChanged("container"))
 
     def _drop_ages(self, gateway: str) -> None:
         for container in self.containers.get(gateway, {}):
@@ -852,19 +876,12 @@ class Registry:
             task.cancel()
         self._drop_ages(gateway)
         self._missing.discard(gateway)
-        for noted in (self._heard, self._as_of, self._doubted, self._asked_by):
+        for noted in (self._heard, self._as_of, self._doubted, self._asked_by, self.clock_s):
             noted.pop(gateway, None)
         if self.gateways.pop(gateway, None) is not None:
-            self._tell("gateway")
+            self._events.publish(FactsChanged("gateway"))
         if self.containers.pop(gateway, None) is not None:
-            self._tell("container")
-
-    def _tell(self, kind: str) -> None:
-        for callback in tuple(self.on_change):
-            try:
-                callback(kind)
-            except Exception:  # supervision boundary: a listener's defect must not stop the facts
-                log.exception("a listener to the facts failed", kind=kind)
+            self._events.publish(FactsChanged("container"))
 
     async def close(self) -> None:
         """Publish what waits, listen no more."""

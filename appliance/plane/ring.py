@@ -15,7 +15,7 @@ from appliance.errors import UnreachableError
 RING_BITS = 160
 RING_SIZE = 2**RING_BITS
 _FEW = 8
-"""Members that come or go at once; beyond so many a ring made anew is as cheap as one changed."""
+"""Members that come or go at once; beyond so many a ring built again is as cheap as one changed."""
 
 _MOST_RECENT = 8
 _LOCK = threading.Lock()

@@ -1,12 +1,14 @@
 """What an operator may set about the plane, each default with its reason."""
 
+import ipaddress
+from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
 
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, PayloadError
-from appliance.plane.keys import check_name
+from appliance.model.keys import check_name
 
 _WITH_PORT = frozenset({"tcp", "udp", "tls", "quic", "ws"})
 _PROTOCOLS = _WITH_PORT | {"unixsock-stream", "serial"}
@@ -19,14 +21,22 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """`peer`: a few gateways, full mesh by gossip. `client`: everybody else, and the gateways of a fleet of more than
     about thirty, which link to one of the routers in `connect` (`swiftbot router`). `router`: routes for clients."""
     listen: tuple[str, ...] = ()
-    """Endpoints to accept links on, such as `tcp/0.0.0.0:7447`; empty: accept none."""
+    """Endpoints to accept links on, such as `tls/0.0.0.0:7447`; empty: accept none. Without `keys` only on the
+    loopback, such as `tcp/127.0.0.1:7447`; with them `tls` or `quic`."""
+    keys: str = ""
+    """File with private key and certificate of this process, as `swiftbot keys issue` writes it. Every link is
+    authenticated by both sides then, and each role is held to what docs/keyspace.md says of it. Empty: links within
+    this machine only, on which everybody may do everything."""
+    roster: str = ""
+    """The authority's roster: which robots there are, and which certificates are revoked. Empty: `roster.json` in the
+    folder of `keys`."""
     connect: tuple[str, ...] = ()
     """Endpoints to keep linked to: of routers, or of gateways that name nobody in `connect` themselves. Gossip finds
     the others, but a single cut link is redialled only where it is named. Gateways that know each other belong into
     `peers`."""
     peers: dict[str, str] = field(default_factory=dict[str, str])
     """All gateways of a fleet of peers, this one among them, by `id`: the endpoint under which the others reach each,
-    as in `{gw-1 = "tcp/10.0.0.1:7447", gw-2 = "tcp/10.0.0.2:7447"}`. The same table in each of them: of each two, one
+    as in `{gw-1 = "tls/10.0.0.1:7447", gw-2 = "tls/10.0.0.2:7447"}`. The same table in each of them: of each two, one
     dials the other, so that a standstill of either cannot mix up two links between them."""
     replicas: int = 3
     """Copies of a record, the owner's among them: two gateways may die at once without losing one (design: r = 3)."""
@@ -66,7 +76,7 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """The same in bytes."""
     backlog_s: float = 10.0
     """How long what was put is kept for a recorder that was not linked at that moment: it restarts in 2 s, and a link
-    that stood still is made anew within 3 s."""
+    that stood still is reopened within 3 s."""
     backlog_bytes: int = 8 * 2**20
     """Bound of the same in memory; 0: nothing is kept, and what a recorder misses is only counted."""
     concurrent_queries: int = 256
@@ -80,7 +90,7 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                 protocol, slash, address = endpoint.partition("/")
                 if not slash or protocol not in _PROTOCOLS or not address:
                     raise ConfigError(
-                        f"plane.{name}: {endpoint!r} is not an endpoint", remedy="write it like tcp/192.168.1.10:7447"
+                        f"plane.{name}: {endpoint!r} is not an endpoint", remedy="write it like tls/192.168.1.10:7447"
                     )
                 if protocol in _WITH_PORT:
                     _check_port(name, endpoint, address)
@@ -107,6 +117,33 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                 f"{self.max_payload_bytes:,} once encoded",
                 remedy="keep it under 0.7 of max_payload_bytes",
             )
+
+    def check_links(self) -> None:
+        """Raise ConfigError for a link that would be neither authenticated nor within this machine."""
+        peers = tuple(self.peers.values())
+        for name, endpoints in (("listen", self.listen), ("connect", self.connect), ("peers", peers)):
+            for endpoint in endpoints:
+                self._check_link(name, endpoint)
+
+    def _check_link(self, name: str, endpoint: str) -> None:
+        if self.keys:
+            if endpoint.partition("/")[0] not in AUTHENTICATED:
+                raise ConfigError(
+                    f"plane.{name}: {endpoint!r} carries no certificates, and plane.keys is set",
+                    remedy=f"write tls/{endpoint.partition('/')[2]}",
+                )
+        elif not is_local(endpoint):
+            raise ConfigError(
+                f"plane.{name}: {endpoint!r} is beyond this machine, and plane.keys is not set: "
+                "anybody who reaches it could command every robot",
+                remedy="`swiftbot keys init` and `swiftbot keys issue gateway NAME --host ADDRESS` make keys; or use "
+                "127.0.0.1",
+            )
+
+    @property
+    def roster_file(self) -> Path:
+        """Where the roster is; of no meaning without keys."""
+        return Path(self.roster or Path(self.keys).parent / "roster.json").expanduser()
 
     def _check_peers(self) -> None:
         if not self.peers:
@@ -150,6 +187,31 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             )
 
 
+AUTHENTICATED = frozenset({"tls", "quic"})
+"""Protocols that carry certificates of both sides."""
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether a link stays within this machine, as far as the endpoint says."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol not in _WITH_PORT:
+        return protocol == "unixsock-stream"
+    host = (urlsplit(f"//{address}").hostname or "").partition("%")[0]
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def dialled_here(endpoint: str) -> str:
+    """Where what listens on an endpoint is dialled on this machine: on the loopback, if it listens on any address."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    if protocol not in _WITH_PORT or host not in _ANY:
+        return endpoint
+    return f"{protocol}/{'[::1]' if host == '[::]' else '127.0.0.1'}:{port}"
+
+
 _ANY = frozenset({"0.0.0.0", "[::]", "*", ""})  # noqa: S104 - hosts to listen on that nobody can dial
 _LEAST: dict[str, float] = {
     "replicas": 1,
@@ -180,4 +242,4 @@ def _check_port(name: str, endpoint: str, address: str) -> None:
     except ValueError:
         port = None
     if port is None:
-        raise ConfigError(f"plane.{name}: {endpoint!r} has no valid port", remedy="write it like tcp/192.168.1.10:7447")
+        raise ConfigError(f"plane.{name}: {endpoint!r} has no valid port", remedy="write it like tls/192.168.1.10:7447")

@@ -12,7 +12,7 @@ row it steps to, and waits for it again, up to the switch interval of 5 ms while
 and digests took 7 ms alone and 4.6 s beside a busy thread, in pages 8 ms and 15 ms.
 
 Reads on the event loop are answered from the committed records in memory, without the store's thread (`Picture`). It is
-written only after a commit, by the store's thread, so that nobody is told what a failing disk could still take back.
+written only after a commit, by the store's thread, so that nobody hears what a failing disk could still take back.
 All keys are known, so that it can say that there is no such record; of the records as many as fit, those used last.
 """
 
@@ -35,7 +35,8 @@ import structlog
 
 from appliance.errors import ConfigError, PrerequisiteError, RefusedError, SwiftbotError
 from appliance.model import VersionVector
-from appliance.plane.records import Record, digest
+from appliance.model.plane_api import Record
+from appliance.plane.records import digest
 
 log = structlog.get_logger(__name__)
 
@@ -376,7 +377,7 @@ Outcome = tuple[Any, Exception | None]
 
 
 class Commits:
-    """The thread and what waits for it. `opened` is told, on the thread, when the file is open or why it is not."""
+    """The thread and what waits for it. `opened` is called, on the thread, when the file is open or why it is not."""
 
     def __init__(self, path: Path, opened: Callable[[Exception | None], None]) -> None:
         self.path = path
@@ -419,7 +420,7 @@ class Commits:
             self._wake()
 
     def _wake(self) -> None:
-        """Have the thread look what waits; whoever calls has the lock."""
+        """Have the thread look what waits; the one that calls has the lock."""
         if not self._signalled:
             self._signalled = True
             self._signals.put(None)
@@ -460,7 +461,7 @@ class Commits:
         try:
             db = self.file.connect()
             self.picture = Picture(read_keys(db))
-        except Exception as error:  # noqa: BLE001 - supervision boundary: whatever went wrong must reach whoever opens
+        except Exception as error:  # noqa: BLE001 - supervision boundary: whatever went wrong must reach the one that opens
             self._opened(error)
             return
         self._opened(None)
@@ -530,7 +531,7 @@ class Commits:
         return outcomes
 
     def _durable(self, batch: list[Call]) -> bool:
-        """Whether one of them must be on the disk when it is told."""
+        """Whether one of them must be on the disk when it is acknowledged."""
         for call in batch:  # noqa: SIM110 - most often it is one
             if call.durable and call.writes:
                 return True
@@ -679,7 +680,7 @@ class Store:
             self._post(decided, record, None)
             return record
 
-        # In a transaction, so that it is told of before its commit: others store it meanwhile.
+        # In a transaction, so that it is known before its commit: others store it meanwhile.
         self._commits.submit(Call(run, done, writes=True, durable=durable))
         return decided, committed
 
@@ -695,7 +696,7 @@ class Store:
     def watch(self, heed: Callable[[str], bool], tell: Callable[[Record], None]) -> Callable[[], None]:
         """Have `tell` hear, on the event loop and in order, of every record committed from now on whose key is heeded.
 
-        Whoever wrote it: this gateway, another one, or a comparison with other copies. Removals count too.
+        The writer may be this gateway, another one, or a comparison with other copies. Removals count too.
 
         Args:
             heed: whether a key is of interest; called on the store's thread for every record, so it must be quick, must

@@ -55,6 +55,7 @@ class Allocator:
         begin: begins a start for a need and returns its container, None without room; raises when it would be in vain.
         on_change: told the facts of all containers after something changed, once per turn of the event loop.
         refused: counts what is declined.
+        full: makes the refusal of a run for which there is no place in the queue.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Allocator:
         begin: Callable[[Need], PooledContainer | None],
         on_change: Callable[[tuple[ContainerInfo, ...]], None],
         refused: Counter[str],
+        full: Callable[[], RefusedError] = lambda: RefusedError("too many runs wait for a container"),
     ) -> None:
         self._config = config
         self._begin = begin
@@ -77,8 +79,7 @@ class Allocator:
         self._watchers: set[asyncio.Event] = set()
         self._telling = False
         self._numbers = itertools.count(1)
-        self.full: Callable[[], RefusedError] = lambda: RefusedError("too many runs wait for a container")
-        """What is told to one for whom there is no place in the queue."""
+        self._full = full
 
     # --- what is --------------------------------------------------------------------------------------------
 
@@ -141,7 +142,7 @@ class Allocator:
         self._facts = None
 
     def changed(self) -> None:
-        """Note that facts have changed; all changes of one turn of the event loop are told at once."""
+        """Note that facts have changed; all changes of one turn of the event loop are published at once."""
         self._facts = None
         if not self._telling:
             self._telling = True
@@ -233,7 +234,7 @@ class Allocator:
         self.changed()
 
     def ready(self, container: PooledContainer) -> None:
-        """Make a container ready for the next: whoever waits first, or else anybody."""
+        """Make a container ready for the next: the first in the queue, or else anybody."""
         if self._held.get(container.id) is not container:
             return
         container.reservation = ""
@@ -271,7 +272,7 @@ class Allocator:
         return self._turns.order([*waiting, turn], time.monotonic())[-1]
 
     def withdraw(self, run_id: str) -> bool:
-        """Take a run out of the queue, unless it has been served: whoever waits for it gets a WithdrawnError."""
+        """Take a run out of the queue, unless it has been served: its `wait` raises WithdrawnError."""
         for waiter in self._waiting.values():
             if waiter.turn.id == run_id and not waiter.got.done() and not waiter.has_own:
                 waiter.got.set_exception(WithdrawnError(f"{run_id} was taken out of the queue"))
@@ -279,14 +280,14 @@ class Allocator:
         return False
 
     def _take_a_place(self, need: Need, turn: Turn) -> _Waiter:
-        """Join the queue; a full one turns away whoever would be served last, be it the one who comes."""
+        """Join the queue; a full one turns away the run that would be served last, be it the newest."""
         waiting = self._without()
         if len(waiting) >= self._config.queue and waiting:
             last = self._last(turn)
             self._refused["queue full"] += 1
             if last.number == turn.number:
-                raise self.full()
-            self._waiting[last.number].got.set_exception(self.full())
+                raise self._full()
+            self._waiting[last.number].got.set_exception(self._full())
         waiter = self._waiting[turn.number] = _Waiter(need, turn)
         return waiter
 
@@ -322,8 +323,8 @@ class Allocator:
     ) -> PooledContainer:
         """Wait until `own`, which is starting for a run, has `started`, or another comes free before that.
 
-        A start takes a hundred times as long as many a run, so whoever waits for one takes what comes free meanwhile,
-        in turn with all who wait; its own is then for the next. What is not returned has been given back.
+        A start takes a hundred times as long as many a run, so a run that waits for one takes what comes free
+        meanwhile, in turn with all who wait; its own is then for the next. What is not returned has been given back.
 
         Raises:
             SwiftbotError: it did not start.

@@ -336,7 +336,7 @@ class PooledContainer:
         return self._ending or LOST
 
     def close(self, *, told_later: bool = False) -> None:
-        """Hang up; a run in progress is ended by its runner, and whoever listens to it sees the end of file.
+        """Hang up; a run in progress is ended by its runner, and its listener sees the end of file.
 
         `told_later`: how it ended is being found out, and `tell_ending` follows.
         """

@@ -4,24 +4,24 @@
 
 A selection and an eviction are plain functions of facts (`selection`, `policies`). The facts are gone a moment later;
 so a trace for the log (`SelectionCase`, `EvictionCase`) has them with the decision, as far as it depends on them:
-containers that are no candidates are left out, and what moving bytes costs is a table of the prices that were asked.
+containers that are no candidates are left out, and links that were not measured.
 `select_again` and `evict_again` replay a trace with the same code.
 """
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
 import structlog
 from msgspec import Struct
 
-from appliance.model import ContainerInfo, Need, Phase, VolumeInfo, Way
-from appliance.pool.api import DecisionList, PoolDecision
+from appliance.model import ContainerInfo, Need, Phase, Way
+from appliance.model.pool_api import DecisionList, PoolDecision
 from appliance.pool.policies import Idle
 from appliance.pool.policies.planner import Weighed, victims
-from appliance.pool.selection import Candidate, Decision, Facts, score, select
+from appliance.pool.selection import UNMEASURED, Candidate, Decision, Facts, score, select
 from appliance.pool.settings import PoolConfig, Weights
 
 log = structlog.get_logger(__name__)
@@ -52,15 +52,7 @@ class Decisions:
 
 
 MOST_IDLE = 256
-"""Idle containers that are told of one eviction: a gateway holds fewer."""
-
-
-class Price(Struct, frozen=True):
-    """What moving so many bytes between here and a gateway was said to take, milliseconds."""
-
-    size_bytes: int
-    gateway: str
-    ms: float
+"""Idle containers recorded of one eviction: a gateway holds fewer."""
 
 
 class SelectionCase(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -77,11 +69,7 @@ class SelectionCase(Struct, frozen=True, kw_only=True, omit_defaults=True):
     gamma: float
     theta_match: float
     weights: Weights
-    inputs: dict[str, int] = {}
-    volumes: dict[str, tuple[VolumeInfo, ...]] = {}
-    files: tuple[Price, ...] = ()
-    state: tuple[Price, ...] = ()
-    avoid: dict[str, str] = {}
+    facts: Facts = Facts()
     phase: Phase
     way: Way
     chosen: str
@@ -102,28 +90,6 @@ class EvictionCase(Struct, frozen=True, kw_only=True, omit_defaults=True):
     chosen: tuple[str, ...]
 
 
-class PriceList:
-    """Notes the prices that a selection asks for."""
-
-    def __init__(self, ask: Callable[[int, str], float]) -> None:
-        self._ask = ask
-        self._asked: dict[tuple[int, str], float] = {}
-
-    def __call__(self, size_bytes: int, gateway: str) -> float:
-        """Return what the real list says."""
-        ms = self._asked[size_bytes, gateway] = self._ask(size_bytes, gateway)
-        return ms
-
-    def prices(self) -> tuple[Price, ...]:
-        """Return what was asked."""
-        return tuple(Price(size, gateway, ms) for (size, gateway), ms in self._asked.items())
-
-
-def watched(facts: Facts) -> Facts:
-    """Return the facts with price lists that note what is asked of them."""
-    return msgspec.structs.replace(facts, files_ms=PriceList(facts.files_ms), state_ms=PriceList(facts.state_ms))
-
-
 def selection_case(
     decision: Decision,
     *,
@@ -135,8 +101,8 @@ def selection_case(
     gateway: str,
     facts: Facts,
 ) -> SelectionCase:
-    """Return a selection with all that it rested on; the price lists of `facts` are those of `watched`."""
-    files, state = facts.files_ms, facts.state_ms
+    """Return a selection with all that it rested on."""
+    links = {at: link for at, link in facts.links.items() if link != UNMEASURED and (facts.inputs or facts.volumes)}
     return SelectionCase(
         gateway=gateway,
         need=need,
@@ -147,11 +113,7 @@ def selection_case(
         gamma=config.gamma,
         theta_match=config.theta_match,
         weights=config.weights,
-        inputs=dict(facts.inputs),
-        volumes=dict(facts.volumes),
-        files=files.prices() if isinstance(files, PriceList) else (),
-        state=state.prices() if isinstance(state, PriceList) else (),
-        avoid=dict(facts.avoid),
+        facts=msgspec.structs.replace(facts, links=links),
         phase=decision.phase,
         way=decision.way,
         chosen=decision.gateway,
@@ -172,14 +134,7 @@ def select_again(case: SelectionCase) -> dict[str, Any]:
         },
         PoolConfig,
     )
-    facts = Facts(
-        inputs=case.inputs,
-        volumes=case.volumes,
-        files_ms=_listed(case.files),
-        state_ms=_listed(case.state),
-        avoid=case.avoid,
-    )
-    decision = select(case.need, case.local, case.remote, case.cold_ms, config, gateway=case.gateway, facts=facts)
+    decision = select(case.need, case.local, case.remote, case.cold_ms, config, gateway=case.gateway, facts=case.facts)
     return {
         "phase": decision.phase,
         "way": decision.way,
@@ -188,12 +143,6 @@ def select_again(case: SelectionCase) -> dict[str, Any]:
         "score": decision.score,
         "cost_ms": decision.cost_ms,
     }
-
-
-def _listed(prices: Sequence[Price]) -> Callable[[int, str], float]:
-    table = {(each.size_bytes, each.gateway): each.ms for each in prices}
-    # A price that was not asked then is asked only by another decision: any figure shows that.
-    return lambda size, gateway: table.get((size, gateway), 0.0)
 
 
 def eviction_case(weighed: Weighed, *, gateway: str) -> EvictionCase:

@@ -12,17 +12,17 @@ Guarantees: a container is created with `--read-only`, no capability, no new pri
 it makes in its bind-mounted folder belong to the service user (rootless: root inside is that user outside).
 
 `EngineLink` reconnects: Podman is reached when it can be, known to be away when it cannot, tried again with backoff
-until it is back. Containers that run need no Podman, only starting and removing do; so its absence is told and mended
-in the background, never a reason for the pool to stop.
+until it is back. Containers that run need no Podman, only starting and removing do; so its absence is reported and
+mended in the background, never a reason for the pool to stop.
 
-`PodmanStorage` is Podman's images and volumes as transfers need them: the slow calls, on a client of their own. An
-image of 150 MB takes Podman three seconds to give; on the threads that start containers that would be three seconds
-without starts. All traps found there are of Podman 4.3: `pull` takes no transport but a registry's over the API, `get`
-gives layers uncompressed only as docker-archive, and `load` of an OCI archive needs no layer that is in the storage
-already.
+The API itself (`client.api`) is asked where podman-py would inspect each container of a list, wait 10 s for one that
+ignores SIGTERM, or hold a whole image in memory. Traps of Podman 4.3: `pull` takes no transport but a registry's over
+the API, `get` gives layers uncompressed only as docker-archive, and `load` of an OCI archive needs no layer that is in
+the storage already.
 """
 
 import asyncio
+import contextlib
 import json
 import os
 import socket
@@ -39,7 +39,7 @@ import podman
 import requests
 import structlog
 from msgspec import Struct
-from podman.errors import APIError, ImageNotFound, PodmanError
+from podman.errors import APIError, ImageNotFound, NotFound, PodmanError
 
 from appliance.errors import NotFoundError, PoolError, PrerequisiteError, SwiftbotError, UnreachableError
 
@@ -58,8 +58,8 @@ LABEL_GATEWAY = "swiftbot.gateway"
 LABEL_IMAGE = "swiftbot.image"
 LABEL_ID = "swiftbot.id"
 LABEL_STATE = "swiftbot.made"
-"""Hash of all that is fixed when a container is made: image, snapshot, what the runner is told, bounds. Adopted only if
-it is the same, and if the runner has loaded just the code of that snapshot."""
+"""Hash of all that is fixed when a container is made: image, snapshot, the runner's specification, bounds. Adopted only
+if it is the same, and if the runner has loaded just the code of that snapshot."""
 LABEL_SNAPSHOT = "swiftbot.snapshot"
 """Digest of the snapshot of skills and runner that a container mounts (`snapshots`)."""
 LIMITING = frozenset({"memory", "pids", "cpu"})
@@ -118,6 +118,23 @@ class FoundImage(Struct, frozen=True, kw_only=True):
     tags: tuple[str, ...]
     size_bytes: int
     created: str
+
+
+class ImageFacts(Struct, frozen=True, kw_only=True):
+    """An image as it is in the storage. `layers` are the SHA-256 of the uncompressed layers, the lowest first."""
+
+    id: str
+    """SHA-256 of its configuration, hexadecimal."""
+    layers: tuple[str, ...]
+    size_bytes: int = 0
+
+
+class FoundVolume(Struct, frozen=True, kw_only=True):
+    """A named volume that is there."""
+
+    name: str
+    folder: Path
+    labels: dict[str, str]
 
 
 class Exit(Struct, frozen=True, kw_only=True):
@@ -205,7 +222,11 @@ def socket_path(url: str = "") -> Path:
 
 
 class PodmanEngine:
-    """Podman through podman-py on the API socket of the user that runs this."""
+    """Podman through podman-py on the API socket of the user that runs this.
+
+    Transfers have one of their own, with more patience (`for_transfers`): an image of 150 MB takes Podman three seconds
+    to give, which on the threads that start containers would be three seconds without starts.
+    """
 
     def __init__(self, url: str = "", *, threads: int = 4, timeout_s: float = 60.0) -> None:
         self.path = socket_path(url)
@@ -217,6 +238,11 @@ class PodmanEngine:
         self._clients: list[Any] = []
         self.calls: Counter[str] = Counter()
         """What was asked of Podman since the start, by the first word of what it was for: a warm run asks nothing."""
+
+    @classmethod
+    def for_transfers(cls, url: str = "") -> "PodmanEngine":
+        """Return a client for images and volumes."""
+        return cls(url, threads=2, timeout_s=300.0)
 
     def _client(self) -> Any:  # podman-py is untyped in the parts used here
         client = getattr(self._local, "client", None)
@@ -293,7 +319,7 @@ class PodmanEngine:
         """Start a container."""
 
         def work(client: Any) -> None:
-            client.api.post(f"/containers/{container}/start").raise_for_status()
+            _container(client, container).start()
 
         try:
             await self._ask(f"start {container[:12]}", work)
@@ -306,7 +332,7 @@ class PodmanEngine:
         """Kill and remove a container: `remove(force=True)` alone waits 10 s for one that ignores SIGTERM."""
 
         def work(client: Any) -> None:
-            # 404: gone already; 409: not running.
+            # 404: gone already; 409: not running. One without an answer is raised, and not followed by another wait.
             client.api.post(f"/containers/{container}/kill", params={"signal": "KILL"})
             response = client.api.delete(f"/containers/{container}", params={"force": "true", "timeout": "0"})
             if response.status_code != requests.codes.not_found:
@@ -318,7 +344,7 @@ class PodmanEngine:
         """Return the last lines a container wrote, at most 2,000 characters."""
 
         def work(client: Any) -> str:
-            parts = client.containers.get(container).logs(stdout=True, stderr=True, tail=30)
+            parts = _container(client, container).logs(stdout=True, stderr=True, tail=30)
             data = parts if isinstance(parts, bytes) else b"".join(parts)
             return data.decode("utf-8", "replace")[-2000:].strip()
 
@@ -331,9 +357,7 @@ class PodmanEngine:
         """Return how a container ended; None while it runs. PoolError when it is not there."""
 
         def work(client: Any) -> Exit | None:
-            response = client.api.get(f"/containers/{container}/json")
-            response.raise_for_status()
-            state = cast("dict[str, Any]", response.json()["State"])
+            state = cast("dict[str, Any]", client.containers.get(container).attrs["State"])
             if state.get("Running") or str(state.get("Status")) in ("running", "stopping"):
                 return None
             return Exit(code=int(state.get("ExitCode", 0)), oom=bool(state.get("OOMKilled", False)))
@@ -394,8 +418,6 @@ class PodmanEngine:
         """Return the images that have a tag."""
 
         def work(client: Any) -> list[FoundImage]:
-            response = client.api.get("/images/json")
-            response.raise_for_status()
             return [
                 FoundImage(
                     id=str(each["Id"])[:12],
@@ -403,28 +425,86 @@ class PodmanEngine:
                     size_bytes=int(each.get("Size", 0)),
                     created=str(each.get("Created", "")),
                 )
-                for each in response.json()
+                for each in _attributes(client.images.list())
                 if each.get("RepoTags")
             ]
 
         return await self._ask("list images", work)
+
+    async def image(self, reference: str) -> ImageFacts:
+        """Return what an image is made of; NotFoundError when it is not there."""
+        return await self._ask(f"image {reference}", lambda client: _facts(client, reference))
+
+    async def has_image(self, reference: str) -> bool:
+        """Whether an image is there."""
+        return await self._ask(f"image {reference}", lambda client: bool(client.images.exists(reference)))
+
+    async def layers(self) -> frozenset[str]:
+        """Return the SHA-256 of all uncompressed layers of the images in the storage."""
+
+        def work(client: Any) -> frozenset[str]:
+            found: set[str] = set()
+            for each in _attributes(client.images.list())[:_MOST_IMAGES]:
+                with contextlib.suppress(NotFoundError):  # removed just now
+                    found.update(_facts(client, str(each["Id"])).layers)
+            return frozenset(found)
+
+        return await self._ask("layers of images", work)
 
     async def import_image(self, archive: Path, reference: str) -> str:
         """Make an image of a root filesystem's tar archive and return its id."""
 
         def work(client: Any) -> str:
             with archive.open("rb") as body:
-                response = client.api.post(
-                    "/images/import",
-                    params={"reference": reference},
-                    data=body,
-                    headers={"content-type": "application/x-tar"},
-                    timeout=600,
-                )
+                params = {"reference": reference}
+                response = client.api.post("/images/import", params=params, data=body, headers=_TAR, timeout=600)
             response.raise_for_status()
             return str(response.json()["Id"])
 
         return await self._ask(f"import {reference}", work)
+
+    async def export_image(self, image_id: str, take: Callable[[str, BinaryIO], None]) -> None:
+        """Have Podman give an image; `take` gets each blob's SHA-256 and its bytes, uncompressed, on a thread."""
+
+        def work(client: Any) -> None:
+            response = client.api.get(f"/images/{image_id}/get", params={"format": "docker-archive"}, stream=True)
+            try:
+                if response.status_code == requests.codes.not_found:
+                    raise NotFoundError(f"there is no image {image_id[:12]}")
+                response.raise_for_status()
+                with tarfile.open(fileobj=cast("BinaryIO", response.raw), mode="r|") as tar:
+                    for member in tar:
+                        stem, _, suffix = member.name.partition(".")
+                        if len(stem) == 64 and suffix in ("tar", "json") and member.isreg():
+                            body = tar.extractfile(member)
+                            if body is not None:
+                                take(stem, cast("BinaryIO", body))
+            finally:
+                response.close()
+
+        try:
+            await self._ask(f"export image {image_id[:12]}", work)
+        except tarfile.TarError as error:
+            raise PoolError(f"Podman gave image {image_id[:12]} as no archive: {error}") from error
+
+    async def load_image(self, archive: Callable[[], Iterator[bytes]]) -> None:
+        """Load an OCI archive, made piece by piece; PoolError when Podman will not."""
+
+        def work(client: Any) -> None:
+            client.api.post("/images/load", data=archive(), headers=_TAR, timeout=600).raise_for_status()
+
+        await self._ask("load image", work)
+
+    async def remove_image(self, reference: str) -> None:
+        """Take a name from an image, and remove it when that was the last; no error when it is gone."""
+
+        def work(client: Any) -> None:
+            with contextlib.suppress(ImageNotFound):
+                client.images.remove(reference)
+
+        await self._ask(f"remove image {reference}", work)
+
+    # --- volumes ----------------------------------------------------------------------------------------------
 
     async def ensure_volume(self, name: str, labels: Mapping[str, str]) -> None:
         """Make a named volume unless it is there."""
@@ -439,32 +519,41 @@ class PodmanEngine:
             if "already exists" not in error.message:  # another start of this pool made it just now
                 raise
 
-    async def volume_names(self, labels: Mapping[str, str]) -> tuple[str, ...]:
-        """Return the names of the volumes that have all these labels, sorted."""
-        wanted = _filters(labels)
+    async def volume(self, name: str) -> FoundVolume:
+        """Return a named volume; NotFoundError when there is none."""
 
-        def work(client: Any) -> tuple[str, ...]:
-            response = client.api.get("/volumes/json", params={"filters": wanted})
-            response.raise_for_status()
-            return tuple(sorted(str(each["Name"]) for each in response.json() or ()))
+        def work(client: Any) -> FoundVolume:
+            try:
+                return _volume(client.volumes.get(name).attrs)
+            except NotFound as error:
+                raise NotFoundError(f"there is no volume {name}") from error
+
+        return await self._ask(f"volume {name}", work)
+
+    async def volumes(self, labels: Mapping[str, str]) -> list[FoundVolume]:
+        """Return the volumes that have all these labels, by name."""
+
+        def work(client: Any) -> list[FoundVolume]:
+            found = [_volume(each) for each in _attributes(client.volumes.list())]
+            return sorted((each for each in found if labels.items() <= each.labels.items()), key=lambda each: each.name)
 
         return await self._ask("list volumes", work)
 
-    async def remove_unused_volumes(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Remove named volumes but those that a container uses; returns which of them are gone."""
+    async def remove_volume(self, name: str) -> bool:
+        """Remove a volume; False when a container uses it. No error when it is gone."""
 
-        def work(client: Any) -> tuple[str, ...]:
-            gone: list[str] = []
-            for name in names:
-                response = client.api.delete(f"/volumes/{name}")
-                if response.status_code == requests.codes.conflict:
-                    continue  # in use
-                if response.status_code != requests.codes.not_found:
-                    response.raise_for_status()
-                gone.append(name)
-            return tuple(gone)
+        def work(client: Any) -> bool:
+            try:
+                client.volumes.remove(name)
+            except NotFound:
+                return True
+            except APIError as error:
+                if error.response is None or error.response.status_code != requests.codes.conflict:
+                    raise
+                return False
+            return True
 
-        return await self._ask("remove volumes", work)
+        return await self._ask(f"remove volume {name}", work)
 
     def close(self) -> None:
         """Let go of threads and connections; a call in progress is waited for."""
@@ -472,6 +561,38 @@ class PodmanEngine:
         for client in self._clients:
             client.close()
         self._clients.clear()
+
+
+_MOST_IMAGES = 500
+_TAR = {"content-type": "application/x-tar"}
+
+
+def _container(client: Any, container: str) -> Any:
+    """Return podman-py's container without asking Podman for it."""
+    return client.containers.prepare_model({"Id": container})
+
+
+def _attributes(found: Iterable[Any]) -> list[dict[str, Any]]:
+    return [each.attrs for each in found]
+
+
+def _volume(found: Mapping[str, Any]) -> FoundVolume:
+    return FoundVolume(
+        name=str(found["Name"]), folder=Path(found["Mountpoint"]), labels=dict(found.get("Labels") or {})
+    )
+
+
+def _facts(client: Any, reference: str) -> ImageFacts:
+    try:
+        found = cast("dict[str, Any]", client.images.get(reference).attrs)
+    except ImageNotFound as error:
+        raise NotFoundError(f"there is no image {reference}", remedy="swiftbot images list") from error
+    layers = cast("list[str]", cast("dict[str, Any]", found.get("RootFS") or {}).get("Layers") or [])
+    return ImageFacts(
+        id=str(found["Id"]).removeprefix("sha256:"),
+        layers=tuple(str(each).removeprefix("sha256:") for each in layers),
+        size_bytes=int(found.get("Size", 0)),
+    )
 
 
 def _filters(labels: Mapping[str, str]) -> str:
@@ -504,8 +625,8 @@ async def remove_fleet(fleet: str, *, volumes: bool, containers: bool = True, ur
     try:
         found = await engine.containers(labels) if containers else []
         await asyncio.gather(*(engine.remove(each.id) for each in found))
-        names = await engine.volume_names(labels)
-        gone = await engine.remove_unused_volumes(names) if volumes and names else ()
+        names = [each.name for each in await engine.volumes(labels)]
+        gone = tuple([name for name in names if volumes and await engine.remove_volume(name)])
     finally:
         engine.close()
     kept = tuple(name for name in names if name not in gone)
@@ -688,160 +809,3 @@ class EngineLink:
             return
         self.problem = ""
         self._pause_s = self._first_pause_s
-
-
-_MOST_IMAGES = 500
-
-
-class ImageFacts(Struct, frozen=True, kw_only=True):
-    """An image as it is in the storage. `layers` are the SHA-256 of the uncompressed layers, the lowest first."""
-
-    id: str
-    """SHA-256 of its configuration, hexadecimal."""
-    layers: tuple[str, ...]
-    size_bytes: int = 0
-
-
-class FoundVolume(Struct, frozen=True, kw_only=True):
-    """A named volume that is there."""
-
-    name: str
-    folder: Path
-    labels: dict[str, str]
-
-
-class PodmanStorage(PodmanEngine):
-    """Images and volumes of the user's Podman."""
-
-    def __init__(self, url: str = "", *, threads: int = 2, timeout_s: float = 300.0) -> None:
-        super().__init__(url, threads=threads, timeout_s=timeout_s)
-
-    # --- volumes ----------------------------------------------------------------------------------------------
-
-    async def volume(self, name: str) -> FoundVolume:
-        """Return a named volume; NotFoundError when there is none."""
-
-        def work(client: Any) -> FoundVolume:
-            response = client.api.get(f"/volumes/{name}/json")
-            if response.status_code == requests.codes.not_found:
-                raise NotFoundError(f"there is no volume {name}")
-            response.raise_for_status()
-            found = response.json()
-            return FoundVolume(
-                name=str(found["Name"]), folder=Path(found["Mountpoint"]), labels=dict(found.get("Labels") or {})
-            )
-
-        return await self._ask(f"volume {name}", work)
-
-    async def remove_volume(self, name: str) -> None:
-        """Remove a volume that no container uses; no error when it is gone."""
-
-        def work(client: Any) -> None:
-            response = client.api.delete(f"/volumes/{name}")
-            if response.status_code != requests.codes.not_found:
-                response.raise_for_status()
-
-        await self._ask(f"remove volume {name}", work)
-
-    async def volumes(self, labels: Mapping[str, str]) -> list[FoundVolume]:
-        """Return the volumes that have all these labels, by name."""
-
-        def work(client: Any) -> list[FoundVolume]:
-            response = client.api.get("/volumes/json")
-            response.raise_for_status()
-            found = [
-                FoundVolume(name=each["Name"], folder=Path(each["Mountpoint"]), labels=dict(each.get("Labels") or {}))
-                for each in response.json() or ()
-            ]
-            return sorted((each for each in found if labels.items() <= each.labels.items()), key=lambda each: each.name)
-
-        return await self._ask("list volumes", work)
-
-    # --- images -----------------------------------------------------------------------------------------------
-
-    async def image(self, reference: str) -> ImageFacts:
-        """Return what an image is made of; NotFoundError when it is not there."""
-        return await self._ask(f"image {reference}", lambda client: _facts(client, reference))
-
-    async def layers(self) -> frozenset[str]:
-        """Return the SHA-256 of all uncompressed layers of the images in the storage."""
-
-        def work(client: Any) -> frozenset[str]:
-            response = client.api.get("/images/json")
-            response.raise_for_status()
-            found: set[str] = set()
-            for each in response.json()[:_MOST_IMAGES]:
-                try:
-                    found.update(_facts(client, str(each["Id"])).layers)
-                except NotFoundError:
-                    continue  # removed just now
-            return frozenset(found)
-
-        return await self._ask("layers of images", work)
-
-    async def export_image(self, image_id: str, take: Callable[[str, BinaryIO], None]) -> None:
-        """Have Podman give an image; `take` gets each blob's SHA-256 and its bytes, uncompressed, on a thread."""
-
-        def work(client: Any) -> None:
-            response = client.api.get(f"/images/{image_id}/get", params={"format": "docker-archive"}, stream=True)
-            try:
-                if response.status_code == requests.codes.not_found:
-                    raise NotFoundError(f"there is no image {image_id[:12]}")
-                response.raise_for_status()
-                with tarfile.open(fileobj=cast("BinaryIO", response.raw), mode="r|") as tar:
-                    for member in tar:
-                        stem, _, suffix = member.name.partition(".")
-                        if len(stem) == 64 and suffix in ("tar", "json") and member.isreg():
-                            body = tar.extractfile(member)
-                            if body is not None:
-                                take(stem, cast("BinaryIO", body))
-            finally:
-                response.close()
-
-        try:
-            await self._ask(f"export image {image_id[:12]}", work)
-        except tarfile.TarError as error:
-            raise PoolError(f"Podman gave image {image_id[:12]} as no archive: {error}") from error
-
-    async def load_image(self, archive: Callable[[], Iterator[bytes]]) -> None:
-        """Load an OCI archive, made piece by piece; PoolError when Podman will not."""
-
-        def work(client: Any) -> None:
-            response = client.api.post(
-                "/images/load", data=archive(), headers={"content-type": "application/x-tar"}, timeout=600
-            )
-            response.raise_for_status()
-
-        await self._ask("load image", work)
-
-    async def remove_image(self, reference: str) -> None:
-        """Take a name from an image, and remove it when that was the last; no error when it is gone."""
-
-        def work(client: Any) -> None:
-            response = client.api.delete(f"/images/{reference}", params={"force": "false"})
-            if response.status_code != requests.codes.not_found:
-                response.raise_for_status()
-
-        await self._ask(f"remove image {reference}", work)
-
-    async def has_image(self, reference: str) -> bool:
-        """Whether an image is there."""
-        try:
-            await self.image(reference)
-        except (NotFoundError, PrerequisiteError):
-            return False
-        return True
-
-
-def _facts(client: Any, reference: str) -> ImageFacts:
-    response = client.api.get(f"/images/{reference}/json")
-    if response.status_code == requests.codes.not_found:
-        raise NotFoundError(f"there is no image {reference}", remedy="swiftbot images list")
-    response.raise_for_status()
-    found = cast("dict[str, Any]", response.json())
-    layers = cast("list[str]", cast("dict[str, Any]", found.get("RootFS") or {}).get("Layers") or [])
-    return ImageFacts(
-        id=str(found["Id"]).removeprefix("sha256:"),
-        layers=tuple(str(each).removeprefix("sha256:") for each in layers),
-        size_bytes=int(found.get("Size", 0)),
-    )

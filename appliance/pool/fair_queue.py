@@ -99,7 +99,7 @@ class Turns:
         start = max(self._served.get(turn.submitter, 0.0), self._now)
         self._now = start
         self._served[turn.submitter] = start + turn.cost
-        # Whoever is not ahead of the present begins there anyway: the table holds only those served of late.
+        # A submitter that is not ahead of the present begins there anyway: the table holds only those served of late.
         self._served = {name: at for name, at in self._served.items() if at > start}
 
 

@@ -168,7 +168,8 @@ def reference(spec: ImageSpec, config: PoolConfig) -> str:
 def build_command(spec: ImageSpec) -> str:
     """Return the command that builds an image, with the folder of skills that it is in unless it is built in."""
     root = spec.folder.parent.parent
-    return "swiftbot images build" if root == SKILLS else f"swiftbot images build {spec.name} --skills {root}"
+    named = f" {spec.name}" if spec.on_demand else ""
+    return f"swiftbot images build{named}" if root == SKILLS else f"swiftbot images build {spec.name} --skills {root}"
 
 
 def _spec(name: str, catalogue: Catalogue) -> ImageSpec:

@@ -23,13 +23,14 @@ import contextlib
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 import msgspec
 import structlog
 from msgspec import Struct
 
+from appliance.background import Background
 from appliance.errors import PoolError, PrerequisiteError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState, Need, PoolHint, encode
 from appliance.pool.allocator import FOR_A_RUN, Allocator
@@ -146,7 +147,7 @@ class Keepsake:
             try:
                 self._recall(msgspec.json.decode(value, type=Experience))
             except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, ValueError) as error:
-                log.warning("what the pool had learned cannot be read; it learns anew", reason=str(error))
+                log.warning("what the pool had learned cannot be read; it starts from nothing", reason=str(error))
         self._writing = asyncio.create_task(self._write_forever(), name="keep what the pool learns")
 
     async def stop(self) -> None:
@@ -186,7 +187,7 @@ class Starts:
         config: quarantine, first guess of what a cold start costs.
         starter: makes the containers.
         link: Podman.
-        decisions: is told of every start and every failure.
+        decisions: notes every start and every failure.
         on_end: told of each start that ended: the container, and why it is not there (None: it is).
     """
 
@@ -226,7 +227,7 @@ class Starts:
         return container
 
     async def wait(self, container: PooledContainer) -> SwiftbotError | None:
-        """Wait until a start has ended; returns why it failed. Whoever waits may go away without ending it."""
+        """Wait until a start has ended; returns why it failed. Cancelling the wait does not end it."""
         task = self._tasks.get(container.id)
         return await asyncio.shield(task) if task is not None else None
 
@@ -460,7 +461,7 @@ class Planning:
         """
         self.check_image(need.image)
         if self._books.queue >= self._config.queue and not self.has_room(need):
-            # A full queue turns away whoever would be served last, which need not be the one who comes.
+            # A full queue turns away the run that would be served last, which need not be the newest.
             if turn is not None and self._books.queue and not self._books.would_be_last(turn):
                 return
             self._refused["queue full"] += 1
@@ -475,7 +476,7 @@ class Planning:
             raise RefusedError(reason, remedy="swiftbot images build, then swiftbot pool release")
 
     def full(self) -> RefusedError:
-        """Return what is told to one for whom there is no place in the queue."""
+        """Return the refusal of a run for which there is no place in the queue."""
         after_s = self.expected_s(self._books.queue + 1)
         when = "wait" if after_s is None else f"ask again in about {after_s:.1f} s"
         return RefusedError(
@@ -556,7 +557,7 @@ class ContainerManager:
         on_evicted: Callable[[Weighed], None] = lambda _: None,
     ) -> None:
         self.decisions = Decisions()
-        self.books = Allocator(config, begin=self._begin, on_change=on_change, refused=refused)
+        self.books = Allocator(config, begin=self._begin, on_change=on_change, refused=refused, full=self._full)
         self.link = EngineLink(
             make_engine,
             reconnect_s=config.reconnect_s,
@@ -583,14 +584,14 @@ class ContainerManager:
             refused=refused,
             read_memory=read_memory,
         )
-        self.books.full = self.planning.full
-        self._background: set[asyncio.Task[None]] = set()
+        self.background = Background()
+        """What `stop` waits for."""
         self._next_sweep = math.inf
         self.draining = False
         """Nothing new is begun here: no run, no hint, no warming."""
         self._adopted = False
         self._stopped = False
-        self._standing: list[asyncio.Task[None]] = []
+        self._standing = Background()
 
     # --- what is --------------------------------------------------------------------------------------------
 
@@ -598,6 +599,10 @@ class ContainerManager:
     def problem(self) -> str:
         """Why containers, or those of some image, cannot be started now; empty when they can."""
         return self.link.problem or "; ".join(self.starts.problems(self._images).values())
+
+    def _full(self) -> RefusedError:
+        """Say that there is no place for a run; the planner that knows is made after the allocator that asks."""
+        return self.planning.full()
 
     # --- what others ask --------------------------------------------------------------------------------------
 
@@ -628,14 +633,13 @@ class ContainerManager:
         await self._starter.open()
         await self.link.start(CONNECT_WAIT_S)
         for work in (self._tend_forever(), self.planning.memory.run(), self.link.watch()):
-            self._standing.append(asyncio.create_task(work, name=work.__qualname__))
+            self._standing.start(work, work.__qualname__)
 
     async def stop(self, *, keep_containers: bool, patience_s: float) -> None:
         """Let go of everything; containers go on running, to be adopted, if they are to be kept."""
         self._stopped = True
         self.books.send_away()
-        for task in self._standing:
-            task.cancel()
+        self._standing.cancel()
         self.link.cancel()
         self.starts.cancel()
         # Starts are let come to their end: one cut off between two steps would leave a container nobody knows.
@@ -661,14 +665,7 @@ class ContainerManager:
         await self.link.close()
 
     def _unfinished(self) -> list[asyncio.Task[Any]]:
-        standing = [task for task in self._standing if not task.done()]
-        return [*standing, *self.link.unfinished, *self.starts.unfinished, *self._background]
-
-    def spawn(self, work: Coroutine[Any, Any, None], name: str) -> None:
-        """Run something in the background that `stop` waits for."""
-        task = asyncio.create_task(work, name=name)
-        self._background.add(task)
-        task.add_done_callback(self._background.discard)
+        return [*self._standing.tasks, *self.link.unfinished, *self.starts.unfinished, *self.background.tasks]
 
     # --- starting ---------------------------------------------------------------------------------------------
 
@@ -718,7 +715,7 @@ class ContainerManager:
             self.books.drop(container)
             self.books.serve()
         elif container.reservation == FOR_A_RUN:
-            self.books.hold(container, FOR_A_RUN)  # with a lease, should whoever waits go away at this very moment
+            self.books.hold(container, FOR_A_RUN)  # with a lease, should its run go away at this very moment
         else:
             self.books.ready(container)
         container.next_probe = time.monotonic() + self._config.probe_s
@@ -770,7 +767,7 @@ class ContainerManager:
         if ending is not None:
             container.tell_ending(ending)
         container.close(told_later=ask)
-        self.spawn(self._bury(container, ask=ask), f"remove {container.id}")
+        self.background.start(self._bury(container, ask=ask), f"remove {container.id}")
         if serve:
             self.books.serve()
         self._wake.set()
@@ -830,7 +827,7 @@ class ContainerManager:
                 self.books.changed()
             if container.info.state is not ContainerState.STARTING and now >= container.next_probe:
                 container.next_probe = math.inf  # one at a time
-                self.spawn(self._probe(container), f"probe {container.id}")
+                self.background.start(self._probe(container), f"probe {container.id}")
         self.books.serve()
         if self._config.mode == "cold":
             for container in self.books:
@@ -842,7 +839,7 @@ class ContainerManager:
             self._plan(now)
         if now >= self._next_sweep:
             self._next_sweep = now + SWEEP_S
-            self.spawn(self._sweep(), "look for stray containers")
+            self.background.start(self._sweep(), "look for stray containers")
 
     def _plan(self, now: float) -> None:
         """Carry out what the planner wants started and given up."""

@@ -10,7 +10,7 @@ Guarantees:
     - Podman absent or dying stops new containers only: `problem` says why, and those that run serve on.
     - Whatever a handler does, its run ends with one last event.
 
-`Verbs` is what operators and other gateways ask of a pool (`api`): warm this, give up that, start again what would not
+`Verbs` is what operators and other gateways ask of a pool: warm this, give up that, start again what would not
 start. None of it is on a run's way. Every answer says what was done, or why not and what to do about it.
 """
 
@@ -40,7 +40,7 @@ from appliance.model import (
     Site,
     Way,
 )
-from appliance.pool.api import (
+from appliance.model.pool_api import (
     DecisionList,
     DecisionsAsk,
     EvictAsk,
@@ -52,7 +52,7 @@ from appliance.pool.api import (
     Warmed,
 )
 from appliance.pool.container import PooledContainer
-from appliance.pool.decisions import eviction_case, selection_case, watched
+from appliance.pool.decisions import eviction_case, selection_case
 from appliance.pool.engine import Engine, PodmanEngine
 from appliance.pool.fair_queue import Turn, turn_of
 from appliance.pool.manager import ContainerManager, Keepsake, Store
@@ -63,7 +63,7 @@ from appliance.pool.runs import Call, Runs
 from appliance.pool.selection import Candidate, Decision, Facts, select
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
-from appliance.pool.state import ALONE, State
+from appliance.pool.volumes import ALONE, State
 from appliance.skills.catalogue import Catalogue, SkillManifest, broken_promises
 
 log = structlog.get_logger(__name__)
@@ -75,7 +75,7 @@ MOST_WAIT_S = 60.0
 
 
 class Verbs:
-    """The pool's verbs, as the gateway serves them over RPC (`pool/api.py` has the structs)."""
+    """The pool's verbs, as the gateway serves them over RPC (`model.pool_api` has the structs)."""
 
     def __init__(
         self, config: PoolConfig, keeper: ContainerManager, *, gateway: str, catalogue: Catalogue, refused: Counter[str]
@@ -233,7 +233,7 @@ class Pool:
         on_call: carries out what a handler asks of the appliance.
         on_change: told the facts of all containers whenever one of them changes.
         state: where state volumes and images of other gateways come from.
-        store: keeps what the pool learns over a restart; None: it begins anew each time.
+        store: keeps what the pool learns over a restart; None: it begins from nothing each time.
         on_decided: told each selection and eviction with what it rested on (`decisions`), if the settings say so.
         make_engine: Podman, unless a test says otherwise.
         read_memory: what the kernel says of memory, unless a test says otherwise.
@@ -394,7 +394,7 @@ class Pool:
             PoolError: no container is ready and none can be started.
         """
         self._check(need)
-        facts = watched(msgspec.structs.replace(self._facts(need), inputs=inputs or {}, avoid=avoid or {}))
+        facts = msgspec.structs.replace(self._facts(need), inputs=inputs or {}, avoid=avoid or {})
         offers: list[Candidate] = []
         decision = self._choose(need, offers, facts)
         wanting = decision.phase is Phase.COLD or decision.way is Way.BRING_HERE

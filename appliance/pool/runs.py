@@ -17,6 +17,7 @@ from typing import Any, cast
 import structlog
 from msgspec import Struct
 
+from appliance.background import Background
 from appliance.errors import (
     CancelledByOperatorError,
     ContractError,
@@ -35,7 +36,7 @@ from appliance.pool.fair_queue import Turn
 from appliance.pool.manager import ContainerManager
 from appliance.pool.selection import Decision
 from appliance.pool.settings import PoolConfig
-from appliance.pool.state import State
+from appliance.pool.volumes import State
 
 log = structlog.get_logger(__name__)
 
@@ -153,7 +154,7 @@ class Conversation:
         self._on_event = on_event
         self._on_call = on_call
         self._refused = refused
-        self._calls: set[asyncio.Task[None]] = set()
+        self._calls = Background()
         self._lines = 0
         self._news: dict[RunEventKind, RunEvent] = {}
         self._told: dict[RunEventKind, float] = {}
@@ -192,8 +193,7 @@ class Conversation:
             return self.failed(error.code, error.message, remedy="another container takes its place; see its handler")
         finally:
             self._flush()
-            for call in self._calls:
-                call.cancel()
+            self._calls.cancel()
         ending = await self._ending()
         return self.failed(ending.code, ending.message, remedy=ending.remedy)
 
@@ -312,7 +312,7 @@ class Conversation:
         given = frame.get("fields")
         fields = _table(given)
         if given is not None and not isinstance(given, dict):
-            self._refused["run news"] += 1  # its text is told without them
+            self._refused["run news"] += 1  # its text is passed on without them
         self._on_event(self.event(RunEventKind.LOG, note=str(frame.get("text", "")), result=fields or None))
 
     def _note_usage(self, frame: Frame) -> None:
@@ -335,7 +335,7 @@ class Conversation:
 
     async def _call(self, frame: Frame) -> None:
         number = int(_number(frame.get("n")))
-        if len(self._calls) >= MAX_CALLS:
+        if self._calls.count >= MAX_CALLS:
             self._refused["call"] += 1
             error = {"code": "refused", "message": f"{MAX_CALLS} calls are in progress already", "retryable": True}
             await self._reply({"n": number, "error": error})
@@ -346,9 +346,7 @@ class Conversation:
             await self._reply(self._refusal(number, PayloadError(text), retryable=False))
             return
         call = Call(run=self._request, number=number, name=str(frame.get("name", "")), args=_table(frame.get("args")))
-        task = asyncio.create_task(self._carry_out(call), name=f"call {self._request.run_id}/{number}")
-        self._calls.add(task)
-        task.add_done_callback(self._calls.discard)
+        self._calls.start(self._carry_out(call), f"call {self._request.run_id}/{number}")
 
     async def _carry_out(self, call: Call) -> None:
         reply: Frame
@@ -392,7 +390,7 @@ class Conversation:
 BACKSTOP_S = 3.0
 """How much longer than the runner itself the pool waits for a run to end, before it ends the container."""
 ENDING_S = 3.0
-"""How long it is waited for Podman to say how a container ended, before its run is told as lost."""
+"""How long it is waited for Podman to say how a container ended, before its run counts as lost."""
 TRIES = 3
 """Containers that may be found dead at the moment a run is sent to them, before the run is given back."""
 
@@ -548,7 +546,7 @@ class Runs:
         return container
 
     async def _use(self, need: Need, container: PooledContainer, stack: contextlib.AsyncExitStack) -> None:
-        """Use the volumes from now until the run's end is told, so that what follows elsewhere finds what it left."""
+        """Use the volumes until the run's end is published, so that what follows elsewhere finds what it left."""
         if need.volumes:
             await stack.aclose()  # of an earlier try
             try:
@@ -581,7 +579,9 @@ class Runs:
                 # What it left running may still write: swept first, so that what is noted of its state is the end.
                 await self._wind_up(container, connection, conversation)
             elif ended:
-                self._keeper.spawn(self._wind_up(container, connection, conversation), f"wind up {container.id}")
+                self._keeper.background.start(
+                    self._wind_up(container, connection, conversation), f"wind up {container.id}"
+                )
             else:
                 connection.close()
                 self._keeper.retire(container, "its run did not end as it should")

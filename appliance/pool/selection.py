@@ -6,20 +6,22 @@ pool asks it with the ready containers it has, then with those others offer, and
 Phase 1 takes the best ready container here, if the state that the subtask asks for is here or nowhere. Phase 2
 weighs two ways of using what is elsewhere, and takes the cheaper:
 
-    run there   the subtask goes to a ready container there: round trip + input bytes / bandwidth
-                (+ state that is not there either)
-    bring here  state comes to a container here: state bytes / bandwidth + serialise + deserialise + start; the
-                start is nothing for a ready container that merely lacks the newest state, a cold start otherwise
+    run there   the subtask goes to a ready container there: round trip + MigCost of what is not there
+    bring here  state comes to a container here: MigCost, with a cold start unless a ready container merely lacks the
+                newest state
+
+`mig_cost_ms` is MigCost, the one place where moving state and files gets its price; `Link` has what was measured.
 
 Phase 3 is a cold start. Every way is charged what it has to fetch, a cold start too: so gamma compares like with like.
 
 Worked example, weights 0.5 / 0.3 / 0.2: a vision container (1 core, 256 MB) for a base skill that needs half a
 core and 512 MB and no volume: 0.5 * 0.5 + 0.3 * min(1, 2, 0.5) + 0.2 * 1 = 0.25 + 0.15 + 0.2 = 0.6. With 40 MB of
 state on gw-2, 50 MB/s to it and 5 ms/MB to pack and unpack, bringing it to a ready container here costs
-40 / 50 s + 40 * 5 ms = 1000 ms; a container that is ready on gw-2 costs the round trip, so the subtask goes there.
+40 / 50 s + 40 * 5 ms = 1000 ms, and some 45 ms for asking; a container that is ready on gw-2 costs the round trip, so
+the subtask goes there.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from msgspec import Struct, field
 from msgspec.structs import replace
@@ -49,23 +51,67 @@ class Candidate(Struct, frozen=True, kw_only=True):
     round_trip_ms: float
 
 
-def _at_once(_size: int, _gateway: str) -> float:
-    return 0.0
+GUESS_BYTES_PER_S = 12.5e6
+"""A link that was not measured yet: 100 Mbit/s, the slowest wired one on a site."""
+GUESS_HANDLING_BYTES_PER_S = 200e6
+"""Packing or unpacking before it was measured: half of what one loaded core does."""
+BRING_MS = 40.0
+"""What bringing a volume costs however small it is: asking for it, the snapshot there, the swap here (measured with a
+file of 14 bytes on a loaded machine: 50 to 80 ms to the first line of the handler)."""
 
 
-class Facts(Struct, frozen=True, kw_only=True):
-    """What a selection must know besides containers. The defaults: no inputs, no state anywhere, links at no cost."""
+class Link(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What is known of a gateway's link: moving averages, bytes per second; None: not measured yet."""
+
+    bytes_per_s: float | None = None
+    pack_bytes_per_s: float | None = None
+    """Serialise, there."""
+    unpack_bytes_per_s: float | None = None
+    """Deserialise, here."""
+    round_trip_ms: float = 5.0
+
+    @property
+    def bandwidth(self) -> float:
+        """Bytes per second, a careful guess before it was measured."""
+        return self.bytes_per_s or GUESS_BYTES_PER_S
+
+
+UNMEASURED = Link()
+Move = tuple[int, Link]
+"""So many bytes over a link."""
+
+
+def mig_cost_ms(state: Iterable[Move], *, files: Iterable[Move] = (), start_ms: float = 0.0) -> float:
+    """MigCost (algorithms, Container selection): bytes / bandwidth + serialise + deserialise + start, milliseconds.
+
+    Args:
+        state: volumes that have to come; each is asked for, packed there and unpacked here.
+        files: files that have to come, as they are.
+        start_ms: the start of the container that they are for; 0 for one that is ready.
+    """
+    cost_ms = start_ms + sum(size / link.bandwidth * 1e3 for size, link in files)
+    for size, link in state:
+        pack = link.pack_bytes_per_s or GUESS_HANDLING_BYTES_PER_S
+        unpack = link.unpack_bytes_per_s or GUESS_HANDLING_BYTES_PER_S
+        cost_ms += BRING_MS + link.round_trip_ms + max(0, size) * (1 / link.bandwidth + 1 / pack + 1 / unpack) * 1e3
+    return cost_ms
+
+
+class Facts(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a selection must know besides containers. The defaults: no inputs, no state anywhere, unmeasured links."""
 
     inputs: Mapping[str, int] = field(default_factory=dict[str, int])
     """Gateway -> bytes of the subtask's input files that are there."""
     volumes: Mapping[str, tuple[VolumeInfo, ...]] = field(default_factory=dict[str, tuple[VolumeInfo, ...]])
     """Who holds the newest state of each volume asked for; a volume without state anywhere is left out."""
-    files_ms: Callable[[int, str], float] = _at_once
-    """Milliseconds that so many bytes of files take between here and a gateway: size / bandwidth."""
-    state_ms: Callable[[int, str], float] = _at_once
-    """The same of state: serialise + size / bandwidth + deserialise."""
+    links: Mapping[str, Link] = field(default_factory=dict[str, Link])
+    """What was measured of the links to other gateways."""
     avoid: Mapping[str, str] = field(default_factory=dict[str, str])
     """Gateways whose containers are not to be used, with the reason."""
+
+    def link(self, gateway: str) -> Link:
+        """Return what is known of the link to a gateway."""
+        return self.links.get(gateway, UNMEASURED)
 
 
 class Decision(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -126,23 +172,22 @@ class Prices:
         self.lacks_state = bool(missing)
         """Whether the newest state of a volume asked for is elsewhere only."""
         self.state_bytes = sum(each[0].size_bytes for each in missing)
-        inputs_ms = sum(facts.files_ms(size, at) for at, size in facts.inputs.items() if at != here and size > 0)
-        state_ms = sum(min(facts.state_ms(holder.size_bytes, holder.gateway) for holder in each) for each in missing)
-        self.warm_ms: float = inputs_ms + state_ms
+        files = [(size, facts.link(at)) for at, size in facts.inputs.items() if at != here and size > 0]
+        moves = [((holder.size_bytes, facts.link(holder.gateway)) for holder in each) for each in missing]
+        state = [min(each, key=lambda move: mig_cost_ms((move,))) for each in moves]
+        self.warm_ms = mig_cost_ms(state, files=files)
         """Using a ready container here."""
-        self.cold_ms: float = cold_ms + self.warm_ms
+        self.cold_ms = mig_cost_ms(state, files=files, start_ms=cold_ms)
         """Starting one here."""
 
     def there(self, candidate: Candidate) -> float:
         """Running in a container elsewhere: round trip, and what is not there yet."""
         gateway = candidate.container.gateway
-        cost_ms = candidate.round_trip_ms
-        inputs = sum(size for at, size in self._facts.inputs.items() if at != gateway)
-        if inputs:
-            cost_ms += self._facts.files_ms(inputs, gateway)
         # Our link to it stands for the one that state would really take: those between others are not measured here.
-        missing = (each[0].size_bytes for each in self._state if not _is_at(each, gateway))
-        return cost_ms + sum(self._facts.state_ms(size, gateway) for size in missing)
+        link = self._facts.link(gateway)
+        files = [(size, link) for at, size in self._facts.inputs.items() if at != gateway]
+        missing = [(each[0].size_bytes, link) for each in self._state if not _is_at(each, gateway)]
+        return candidate.round_trip_ms + mig_cost_ms(missing, files=files)
 
 
 def _is_at(holders: Sequence[VolumeInfo], gateway: str) -> bool:
@@ -188,16 +233,6 @@ def weigh(
         found.append(_Weighed(candidate, value, cost_ms, problem))
     found.sort(key=lambda each: each.rank, reverse=True)
     return sorted(found, key=lambda each: bool(each.problem))
-
-
-def best_remote(
-    candidates: Sequence[Candidate], need: Need, *, cold_ms: float, config: PoolConfig, facts: Facts | None = None
-) -> tuple[Candidate, float] | None:
-    """Return the candidate with Score >= theta_match and cost < gamma * ColdCost(T): best score, then least cost."""
-    facts = facts or Facts()
-    prices = Prices(need, facts, config, here="", cold_ms=cold_ms)
-    found = weigh(candidates, need, prices=prices, config=config, avoid=facts.avoid)
-    return (found[0].candidate, found[0].score) if found and not found[0].problem else None
 
 
 def select(

@@ -1,5 +1,6 @@
 """What can be set of the pool and its transfers; section `[pool]` of a gateway's file, with its table `transfer`."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
@@ -89,6 +90,11 @@ PAPER_IDLE_S = 600.0
 """The paper's keep-alive."""
 
 
+SECCOMP = Path(__file__).with_name("seccomp.json")
+"""Podman's default profile (containers-common 0.50) without what makes namespaces and mounts or reads other processes:
+for a handler that breaks out of its Python these are the way to the kernel's least tested parts."""
+
+
 class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of one gateway's pool."""
 
@@ -121,8 +127,12 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """OCI runtime; empty: Podman's own with cgroup v2, runc with v1, where crun refuses."""
     podman_url: str = ""
     """API socket as `unix:///path`; empty: $XDG_RUNTIME_DIR/podman/podman.sock."""
+    folders: dict[str, str] = field(default_factory=dict[str, str])
+    """Folders of this machine for skills that name them in `folders`, by name; they are mounted read-only. One that is
+    not given here is `folders/NAME` in `data_dir`."""
     seccomp_profile: str = ""
-    """Path of a seccomp profile; empty: Podman's default one."""
+    """Path of a seccomp profile; empty: the one that comes with the program, tighter than Podman's (no namespaces,
+    mounts, ptrace); `podman`: Podman's own."""
     base_image: str = ""
     """Base of a reachable registry for the images' Containerfiles; empty: made from the host's Debian packages."""
 
@@ -185,6 +195,10 @@ class PoolConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     pressure: PressureConfig = field(default_factory=PressureConfig)
     transfer: TransferConfig = field(default_factory=TransferConfig)
     """How volumes and images come from other gateways."""
+
+    def seccomp_file(self) -> str:
+        """Return the path of the seccomp profile for containers; empty: Podman's own."""
+        return "" if self.seccomp_profile == "podman" else self.seccomp_profile or str(SECCOMP)
 
     def baseline(self) -> "PoolConfig":
         """Return the settings that the policies are to go by: with mode `local` those of the paper."""

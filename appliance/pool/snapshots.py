@@ -32,7 +32,7 @@ def add_bytecode(tree: Path, *, inside: Path | None = None) -> None:
     """Compile all modules below a folder with this Python; another version's ignores what is written.
 
     It is used only while it is of the very source beside it, whose hash it holds. A module that does not compile is
-    left alone: whoever imports it is told what is wrong with it.
+    left alone: importing it says what is wrong with it.
 
     Args:
         tree: the folder.

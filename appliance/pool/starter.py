@@ -39,16 +39,21 @@ from appliance.pool.engine import (
 )
 from appliance.pool.settings import PoolConfig
 from appliance.pool.snapshots import Snapshot, Snapshots, unexpected
-from appliance.pool.state import State
+from appliance.pool.volumes import State
 from appliance.skills.catalogue import SKILLS, Catalogue, SkillManifest
 
 log = structlog.get_logger(__name__)
 
 RUNNER = Path(__file__).resolve().parent / "runner"
 SPEC = "spec.json"
-"""What a container's runner is told, in the container's folder."""
+"""The specification of a container's runner, in the container's folder."""
 PRELOAD_PART = 0.4
 """Part of the time for a start that loading may take; it happens twice where it is rehearsed first."""
+IMPORT_S = 10.0
+"""Longest import of one module or handler, for images that do not ask for more (`load_s`)."""
+FOLDERS = "/folders"
+CACHE = "/cache"
+"""Where containers find the folders of the gateway's machine, and what they cache."""
 ADOPT_TIMEOUT_S = 2.0
 LABEL_SIZE = "swiftbot.size"
 
@@ -87,6 +92,7 @@ class Starter:
         self._gateway = gateway
         self._fleet = fleet
         self._run_dir = run_dir
+        self._data_dir = data_dir
         self._catalogue = catalogue
         self._site = site
         self._proven: set[str] = set()
@@ -98,6 +104,7 @@ class Starter:
         self._snapshots = Snapshots(data_dir / "snapshots")
         self._taken: Snapshot | None = None
         self._roots = _roots(catalogue)
+        self._seccomp = _digest(config.seccomp_file())
 
     async def open(self) -> None:
         """Take the snapshot that all containers mount from now on; ConfigError when that cannot be done."""
@@ -142,6 +149,10 @@ class Starter:
             self._preloads_mb[image] = sum(skill.preload_mb for skill in self.skills(image))
         return self._preloads_mb[image]
 
+    def start_timeout_s(self, image: str) -> float:
+        """Return how long a container of an image may take from its creation to its runner's first answer, seconds."""
+        return max(self._config.start_timeout_s, self._catalogue.images[image].load_s / PRELOAD_PART)
+
     def new(self, image: str, need: Need | None = None) -> PooledContainer:
         """Return a container that is yet to be started."""
         size = self.size(image, need)
@@ -174,8 +185,8 @@ class Starter:
             PoolError, PrerequisiteError, UnreachableError: it could not be started, with the reason.
         """
         began = time.monotonic()
-        spec = self._spec(container, facts)
         image = container.info.image
+        spec = self._spec(container, facts, await asyncio.to_thread(self._make_folders, image))
         runner = {**self._told(image), "proven": self._made(image) in self._proven}
         await asyncio.to_thread(_write, container.folder, runner)
 
@@ -187,11 +198,12 @@ class Starter:
         try:
             for volume in spec.volumes:
                 await engine.ensure_volume(volume, self._labels)
-            container.engine_id = await self._create(spec, engine)
+            container.engine_id = await self._create(image, spec, engine)
             await engine.start(container.engine_id)
 
-            await container.connect(timeout_s=self._config.start_timeout_s, alive=alive)
-            await self._check_code(container, timeout_s=self._config.start_timeout_s)
+            timeout_s = self.start_timeout_s(image)
+            await container.connect(timeout_s=timeout_s, alive=alive)
+            await self._check_code(container, timeout_s=timeout_s)
         except BaseException as error:
             text = await engine.logs(container.engine_id) if container.engine_id else ""
             await self._discard(container, engine)
@@ -217,16 +229,17 @@ class Starter:
         what = f"has loaded other code than snapshot {self._snapshot.digest[:12]} holds: {names}"
         raise PoolError(f"container {container.id} {what if wrong else 'does not say what code it has loaded'}")
 
-    async def _create(self, spec: ContainerSpec, engine: Engine) -> str:
+    async def _create(self, image: str, spec: ContainerSpec, engine: Engine) -> str:
         """Create the container; an image that is not there is asked of the other gateways first."""
         try:
             return await engine.create(spec)
-        except PrerequisiteError as absent:
+        except PrerequisiteError:
             try:
                 await self._state.bring_image(spec.image)
             except SwiftbotError as error:
                 raise PrerequisiteError(
-                    f"image {spec.image} is not on {self._gateway}: {error.message}", remedy=absent.remedy
+                    f"image {spec.image} is not on {self._gateway}: {error.message}",
+                    remedy=images.build_command(self._catalogue.images[image]),
                 ) from error
             log.info("image brought", image=spec.image)
             return await engine.create(spec)
@@ -328,7 +341,8 @@ class Starter:
     def _made(self, image: str) -> str:
         config = self._config
         told = json.dumps(self._told(image), sort_keys=True)
-        bounds = (config.tmp_mb, config.pids, config.runtime, config.seccomp_profile)
+        folders = sorted(self._folders(image).items())
+        bounds = (config.tmp_mb, config.pids, config.runtime, self._seccomp, folders)
         parts = (self.reference(image), self._snapshot.digest, told, bounds)
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
@@ -337,8 +351,37 @@ class Starter:
         used = {RUNNER, SKILLS, *(each.folder.parent for each in self.skills(image))}
         return {name: root for name, root in self._roots.items() if root in used}
 
+    def _folders(self, image: str) -> dict[str, Path]:
+        """Return the machine's folders that skills of an image read, by name."""
+        names = sorted({name for each in self.skills(image) for name in each.folders})
+        given = self._config.folders
+        return {
+            name: Path(given[name]).expanduser().resolve() if name in given else self._data_dir / "folders" / name
+            for name in names
+        }
+
+    def _make_folders(self, image: str) -> dict[str, Path]:
+        """Make the folders of an image that are the gateway's own; returns those of its skills that can be mounted."""
+        if cache := self._cache(image):
+            cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found: dict[str, Path] = {}
+        for name, path in self._folders(image).items():
+            if name not in self._config.folders:
+                path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if path.is_dir():
+                found[name] = path
+            else:
+                log.warning("folder is not mounted", folder=name, path=str(path), reason="it is not there")
+        return found
+
+    def _cache(self, image: str) -> Path | None:
+        """Return the folder that containers of an image cache in; None where no skill of it wants one."""
+        if not any(each.cache for each in self.skills(image)):
+            return None
+        return self._data_dir / "cache" / image
+
     def _told(self, image: str) -> dict[str, Any]:
-        """Return what the runners of an image are told, the same each time: see `runner/spec.py`."""
+        """Return the specification of the runners of an image, the same each time: see `runner/spec.py`."""
         mounted = self._mounted(image)
         inside = {root: f"/{name}" for name, root in mounted.items()}
         skills = self.skills(image)
@@ -359,14 +402,20 @@ class Starter:
             "site": self._site,
             "volumes": "/volumes",
             "reserve_mb": self._config.transfer.reserve_mb,
-            "patience_s": PRELOAD_PART * self._config.start_timeout_s,
+            "import_s": max(IMPORT_S, self._catalogue.images[image].load_s),
+            "patience_s": PRELOAD_PART * self.start_timeout_s(image),
+            "folders": FOLDERS,
+            "cache": CACHE if self._cache(image) else "",
         }
 
-    def _spec(self, container: PooledContainer, facts: EngineFacts) -> ContainerSpec:
+    def _spec(self, container: PooledContainer, facts: EngineFacts, folders: dict[str, Path]) -> ContainerSpec:
         config, info = self._config, container.info
         snapshot = self._snapshot
         mounts = {str(snapshot.folder / name): f"/{name}" for name in self._mounted(info.image)}
-        binds = {str(container.folder): "/run/swiftbot", **mounts}
+        own = {str(container.folder): "/run/swiftbot"}
+        if cache := self._cache(info.image):
+            own[str(cache)] = CACHE
+        binds = {**own, **mounts, **{str(path): f"{FOLDERS}/{name}" for name, path in folders.items()}}
         processes = 0 if facts.limits_enforced else config.user_processes
         inside = "/run/swiftbot"
         command = ("python3", "-s", "-m", "runner.main", "--socket", f"{inside}/{SOCKET}", "--spec", f"{inside}/{SPEC}")
@@ -384,7 +433,7 @@ class Starter:
             command=(*command, "--processes", str(processes)),
             labels=self._labels | labels,
             binds=binds,
-            writable=frozenset({str(container.folder)}),
+            writable=frozenset(own),
             volumes={f"swiftbot-{self._fleet}-{self._gateway}-{name}": f"/volumes/{name}" for name in container.mounts},
             environment={
                 "PYTHONDONTWRITEBYTECODE": "1",
@@ -399,7 +448,7 @@ class Starter:
             pids=config.pids,
             tmp_mb=config.tmp_mb,
             runtime=config.runtime or ("runc" if facts.cgroup_version == "v1" else ""),
-            seccomp_profile=config.seccomp_profile,
+            seccomp_profile=config.seccomp_file(),
             limits=facts.limits_enforced,
         )
 
@@ -410,6 +459,14 @@ def _read_size(found: Found) -> Size | None:
         return msgspec.json.decode(found.labels.get(LABEL_SIZE, ""), type=Size)
     except msgspec.DecodeError:
         return None
+
+
+def _digest(profile: str) -> str:
+    """Return what tells one seccomp profile from another, wherever it lies; empty for Podman's own."""
+    try:
+        return hashlib.sha256(Path(profile).read_bytes()).hexdigest() if profile else ""
+    except OSError:
+        return profile  # Podman says what is wrong with it when a container starts
 
 
 def _write(folder: Path, runner: dict[str, Any]) -> None:

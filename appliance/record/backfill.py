@@ -21,7 +21,9 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from msgspec import Struct
 
+from appliance.background import Background
 from appliance.errors import PayloadError, RecordError, SwiftbotError, UnreachableError
+from appliance.model import keyspace
 from appliance.plane.backlog import UNKNOWN, BacklogAsk, Backlogged, after, moved
 from appliance.plane.session import Session
 from appliance.record.models import LoggedMessage
@@ -283,7 +285,7 @@ class CatchingUp:
         self._lock = threading.Lock()
         self._loop = asyncio.get_running_loop()
         self._tail: asyncio.Task[Tail] | None = None
-        self._fetching: set[asyncio.Task[None]] = set()
+        self._fetching = Background()
         self._turn = asyncio.Semaphore(_AT_ONCE)
         self.fetched = 0
         """Messages that were not heard, and fetched."""
@@ -299,12 +301,12 @@ class CatchingUp:
 
     async def close(self) -> None:
         """Wait a moment for what is being fetched, and count the rest as lost."""
-        if self._fetching:
-            await asyncio.wait(tuple(self._fetching), timeout=_END_S)
-        for task in (*self._fetching, *((self._tail,) if self._tail else ())):
-            task.cancel()
+        await self._fetching.finish(_END_S)
+        await self._fetching.close()
+        if self._tail is not None:
+            self._tail.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await task
+                await self._tail
         with self._lock:
             taken = self._follower.give_all_up()
             taken.holes.clear()
@@ -317,14 +319,12 @@ class CatchingUp:
         for lost in taken.lost:
             self._lose(lost)
         if taken.holes:
-            with contextlib.suppress(RuntimeError):  # the loop has ended: whoever closed it waits for nothing
+            with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits for this
                 self._loop.call_soon_threadsafe(self._ask, taken.holes)
 
     def _ask(self, holes: list[Hole]) -> None:
         for hole in holes:
-            task = self._loop.create_task(self._fill(hole), name="fetch what was missed")
-            self._fetching.add(task)
-            task.add_done_callback(self._fetching.discard)
+            self._fetching.start(self._fill(hole), "fetch what was missed")
 
     async def _fill(self, hole: Hole) -> None:
         async with self._turn:
@@ -373,7 +373,7 @@ class CatchingUp:
             first = moved(answer.upto, 1)
 
     async def _asked(self, source: str, ask: BacklogAsk) -> Backlogged:
-        key = self._session.keys.backlog(source.partition("/")[0])
+        key = self._session.keys(keyspace.BACKLOG, source.partition("/")[0])
         until = time.monotonic() + _TIMEOUT_S * _TRIES
         for left in reversed(range(_TRIES)):
             try:

@@ -130,7 +130,8 @@ def copy(
             os.fsync(file.fileno())
         part.rename(out)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
         raise RecordError(f"cannot write {out}: {error.strerror}", remedy="free space or name another file") from error
     except BaseException:
         with contextlib.suppress(OSError):

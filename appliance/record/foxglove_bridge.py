@@ -16,6 +16,7 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import ConfigError, PrerequisiteError
+from appliance.model import keyspace
 from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
 from appliance.record.models import LoggedMessage, check_expression, compile_expression
@@ -51,7 +52,7 @@ class LiveOptions(Struct, frozen=True, kw_only=True):
         """Raise ConfigError for what cannot be."""
         if self.host not in LOOPBACK:
             raise ConfigError(
-                f"--host {self.host[:60]!r}: whoever connects sees everything, without a password",
+                f"--host {self.host[:60]!r}: every client that connects sees everything, without a password",
                 remedy="listen on 127.0.0.1, and reach it through `ssh -L 8765:127.0.0.1:8765`",
             )
         for each in self.keys:
@@ -91,7 +92,9 @@ class LiveView:
         self._views = Foxglove(session.keys, NAME, site=about.site)
         self._redactor = Redactor(about.secrets)
         keys = session.keys
-        self._raw = tuple(map(compile_expression, (keys.mavlink(), keys.link_frames(), keys.camera())))
+        self._raw = tuple(
+            map(compile_expression, (keys(keyspace.MAVLINK), keys(keyspace.LINK_FRAMES), keys(keyspace.CAMERA)))
+        )
         self._wanted = [compile_expression(each) for each in options.keys]
         self._channels: OrderedDict[tuple[str, str], _Channel | None] = OrderedDict()
         """By key and encoding, the one that was silent for longest first; None: not wanted."""
@@ -123,7 +126,7 @@ class LiveView:
 
     def start(self) -> None:
         """Begin to hear the fleet. Blocks shortly."""
-        self._subscription = self._session.flood(self._session.keys.everything(), LoggedMessage, self._take)
+        self._subscription = self._session.flood(self._session.keys.everything, LoggedMessage, self._take)
 
     def stop(self) -> None:
         """Hear no more, and let the clients go. Blocks shortly."""

@@ -13,8 +13,10 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from appliance.plane.keys import Keys
-from appliance.record.models import Incident, LoggedMessage, Trigger, compile_expression
+from appliance.model import keyspace
+from appliance.model.keys import Keys
+from appliance.model.recorder_api import Incident, Trigger
+from appliance.record.models import LoggedMessage, compile_expression
 
 EVERY = "every"
 """Recorder's name in a trigger that is meant for all recorders."""
@@ -36,14 +38,14 @@ class _Robot(Struct):
 class Triggers:
     """Says which messages are incidents: a task that failed, a failsafe, a soft stop, somebody who asks.
 
-    A fact that is told again and again (a robot's state) is an incident when it begins.
+    A fact that is published again and again (a robot's state) is an incident when it begins.
     """
 
     def __init__(self, keys: Keys, recorder: str) -> None:
-        self._record = compile_expression(keys.task())
-        self._robot = compile_expression(keys.robot())
-        self._asked = tuple(compile_expression(keys.recorder_trigger(each)) for each in (recorder, EVERY))
-        self._stop = compile_expression(keys.soft_stop())
+        self._record = compile_expression(keys(keyspace.TASK_UPDATE))
+        self._robot = compile_expression(keys(keyspace.ROBOT))
+        self._asked = tuple(compile_expression(keys(keyspace.RECORDER_TRIGGER, each)) for each in (recorder, EVERY))
+        self._stop = compile_expression(keys(keyspace.STOP))
         self._told: dict[str, str] = {}
 
     def watches(self, key: str) -> str:
@@ -69,7 +71,7 @@ class Triggers:
         try:
             trigger = msgspec.json.decode(message.payload, type=Trigger)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            return None  # whoever means it says why
+            return None  # one that is meant says why
         by = f" (by {trigger.by[:80]})" if trigger.by else ""
         return _incident(message, "asked", f"{trigger.reason[:300]}{by}")
 

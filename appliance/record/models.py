@@ -10,10 +10,11 @@ import re
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 
-from msgspec import Struct, field
+from msgspec import Struct
 
 from appliance.errors import ConfigError
 from appliance.model import RecorderNote
+from appliance.model.recorder_api import Incident, RecorderStatus
 
 
 class LoggedMessage(Struct, frozen=True):
@@ -30,91 +31,6 @@ class LoggedMessage(Struct, frozen=True):
     deleted: bool = False
     source: str = ""
     number: int = 0
-
-
-class Gap(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Messages that are not in the log, and why: what was dropped is itself written down."""
-
-    reason: str
-    """`queue full`, `disk full`, `too large` or `write error`: dropped here. `not heard`: numbers that a speaker left
-    out, or that were lost on the way here (see `source`)."""
-    dropped: int
-    payload_bytes: int = 0
-    since_ns: int = 0
-    until_ns: int = 0
-    last_key: str = ""
-    """Key of the last message dropped, as a hint."""
-    source: str = ""
-    """Of what was not heard: whose numbers have a hole. `plane`: of a session of the fleet; `mavlink`: frames of a
-    vehicle that no gateway received, lost on its link or while its gateway was down; `log`, `run` and `transition`: of
-    senders whose sessions give no numbers."""
-    keys: dict[str, int] = {}
-    """The same count by kind of key, such as `gw/*/log`."""
-
-
-class Deletion(Struct, frozen=True, kw_only=True):
-    """A key that was deleted: a delete carries no payload, so it cannot stand on its key's own channel."""
-
-    key: str
-    at_ns: int
-
-
-class Trigger(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Somebody, or something, says that what has just happened is worth keeping."""
-
-    reason: str
-    by: str = ""
-
-
-class Incident(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What made the recorder keep what it has, in the log at the place where it happened."""
-
-    reason: str
-    """`task failed`, `failsafe`, `stop` or `asked`."""
-    detail: str = ""
-    key: str = ""
-    """Of the message that told it."""
-    at_ns: int = 0
-    before_s: float = 0.0
-    """How far back the log goes from here, where it had waited in the ring."""
-
-
-class RecorderStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A recorder's account of itself, put every second."""
-
-    id: str
-    fleet: str
-    state: str = "starting"
-    """`recording`, `waiting` (for an incident), `paused` (see `problem`), `failed` or `stopped`."""
-    problem: str = ""
-    file: str = ""
-    """File name within the recorder's directory."""
-    files: int = 0
-    messages: int = 0
-    file_bytes: int = 0
-    queued: int = 0
-    dropped: dict[str, int] = field(default_factory=dict[str, int])
-    """Messages not recorded, by reason."""
-    not_heard: dict[str, int] = field(default_factory=dict[str, int])
-    """Messages that never came here, by whose numbers they are missing from."""
-    fetched: int = 0
-    """Messages that did not reach it when they were put, and were fetched from their senders afterwards."""
-    missed: dict[str, int] = field(default_factory=dict[str, int])
-    """Messages of the fleet that are not in its log, dropped or not heard, by kind of key, such as `gw/*/log`."""
-    missed_at_ns: int = 0
-    """Time of the last of them; 0: none is missing."""
-    redacted: int = 0
-    """Messages from which a secret was taken."""
-    incidents: int = 0
-    last_incident: str = ""
-    unwritten_incidents: int = 0
-    """Of them, those that wait in memory until there is room on the disk."""
-    held: int = 0
-    """Messages that wait in the ring for an incident."""
-    removed: int = 0
-    """Old files removed to stay within the disk budget."""
-    started_ns: int = 0
-    at_ns: int = 0
 
 
 class ChannelInfo(Struct, frozen=True, kw_only=True):
@@ -229,7 +145,7 @@ class Recorders:
 
 
 def note_of(status: RecorderStatus, *, silent: bool = False) -> RecorderNote:
-    """Return the part of a recorder's status that others are told of."""
+    """Return the part of a recorder's status that goes into its gateway's."""
     most = sorted(status.missed.items(), key=lambda each: (-each[1], each[0]))
     keys = dict(most[:_KINDS])
     if rest := sum(count for _, count in most[_KINDS:]):

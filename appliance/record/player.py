@@ -6,7 +6,7 @@ somebody act is left out: requests for tasks, triggers of recorders. The gateway
 present while they speak in it, since listeners believe nobody else.
 
 `Playhead` is the playback clock, a pure function of the clock that is passed in: `position(now) = mark + (now - since)
-· rate`, where `mark` and `since` are set anew whenever the rate changes, the replay is paused or goes on, or jumps. A
+· rate`, where `mark` and `since` are set again whenever the rate changes, the replay is paused or goes on, or jumps. A
 rate of 0 means as fast as the listener takes it: then the position is wherever the last message was. Logs that are
 played onto the plane and those on the screens go by the same.
 """
@@ -22,8 +22,9 @@ from pathlib import Path
 from msgspec import Struct
 
 from appliance.errors import ConfigError
-from appliance.model import encode
-from appliance.plane.keys import Keys
+from appliance.model import keyspace
+from appliance.model.keys import Keys
+from appliance.model.recorder_api import Clock
 from appliance.plane.session import Closer, Session
 from appliance.record.edit import Select, span
 from appliance.record.models import LoggedMessage, compile_expression
@@ -142,16 +143,6 @@ _FOREIGN = re.compile(r"[*$?#]")
 _FLEET_CHUNKS = 2
 
 
-class Clock(Struct, frozen=True, kw_only=True):
-    """The time in a log that is being replayed, put a few times a second."""
-
-    at_ns: int
-    rate: float
-    """Seconds of the log a second; 0: as fast as possible."""
-    paused: bool = False
-    ended: bool = False
-
-
 class PlayOptions(Struct, frozen=True, kw_only=True):
     """How logs are played. Times are Unix nanoseconds of the log."""
 
@@ -164,7 +155,7 @@ class PlayOptions(Struct, frozen=True, kw_only=True):
     remap: tuple[tuple[str, str], ...] = ()
     """Beginning of a key, in whole chunks, and what takes its place; the first that fits."""
     orders: bool = False
-    """Play requests for tasks and triggers too: whoever listens will act on them."""
+    """Play requests for tasks and triggers too: listeners will act on them."""
     clock: bool = True
     presence: bool = True
 
@@ -402,7 +393,7 @@ class Player:
             self._told(position_ns, self._messages)
             if self._options.clock:
                 clock = Clock(at_ns=position_ns, rate=self._head.rate, paused=self._head.paused, ended=ended)
-                self._session.put(self._session.keys.clock(), encode(clock))
+                self._session.publish(keyspace.REPLAY_CLOCK, clock)
 
         async def tick() -> None:
             while True:
@@ -425,16 +416,19 @@ class _Presence:
     def __init__(self, session: Session) -> None:
         self._session = session
         keys: Keys = session.keys
-        self._statuses, self._robots = compile_expression(keys.status()), compile_expression(keys.robot())
+        self._statuses, self._robots = (
+            compile_expression(keys(keyspace.STATUS)),
+            compile_expression(keys(keyspace.ROBOT)),
+        )
         self._shown: dict[str, tuple[Closer, int]] = {}
         self._looked_ns = 0
 
     def heard(self, key: str, message: LoggedMessage) -> None:
         token = ""
         if self._statuses.fullmatch(key):
-            token = self._session.keys.alive(key.split("/")[3])
+            token = self._session.keys(keyspace.GATEWAY_ALIVE, *keyspace.STATUS.names(key))
         elif self._robots.fullmatch(key):
-            token = self._session.keys.robot_alive(key.split("/")[3])
+            token = self._session.keys(keyspace.ROBOT_ALIVE, *keyspace.ROBOT.names(key))
         at_ns = message.at_ns
         if token:
             shown = self._shown.get(token)

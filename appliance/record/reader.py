@@ -31,8 +31,9 @@ from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 
 from appliance.errors import NotFoundError, RecordError
+from appliance.model.recorder_api import Deletion, Gap, Incident
 from appliance.plane.backlog import UNKNOWN, kind_of
-from appliance.record.models import ChannelInfo, Deletion, Gap, Incident, LoggedMessage, LogInfo, compile_expression
+from appliance.record.models import ChannelInfo, LoggedMessage, LogInfo, compile_expression
 from appliance.record.segments import METADATA, VEHICLE
 
 MAGIC = bytes((137, 77, 67, 65, 80, 48, 13, 10))
@@ -421,7 +422,7 @@ def _from_index(path: Path) -> LogInfo | None:
             told = {number: channel.topic for number, channel in summary.channels.items() if _is_told(channel.topic)}
             for index in sorted(summary.chunk_indexes, key=lambda each: each.chunk_start_offset):
                 if not told or (index.message_index_offsets and told.keys().isdisjoint(index.message_index_offsets)):
-                    continue  # not of what is told; where the messages have no index, every chunk may be
+                    continue  # it has no gap or incident; where the messages have no index, every chunk may be
                 for record in chunk_at(stream, index.chunk_start_offset):
                     if isinstance(record, Message) and record.channel_id in told:
                         account.take(told[record.channel_id], record.data)

@@ -22,14 +22,15 @@ import structlog
 from msgspec import Struct, structs
 
 from appliance.errors import RecordError
-from appliance.model import encode
+from appliance.model import keyspace
+from appliance.model.keys import Keys
+from appliance.model.recorder_api import Incident, RecorderStatus
 from appliance.plane.backlog import kind_of
-from appliance.plane.keys import Keys
 from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
 from appliance.record.backfill import CatchingUp, Lost, Tail, tail_of
 from appliance.record.incidents import Gate, Triggers
-from appliance.record.models import Incident, LoggedMessage, RecorderStatus, compile_expression
+from appliance.record.models import LoggedMessage, compile_expression
 from appliance.record.redact import Redactor
 from appliance.record.segments import NOT_HEARD, PLANE, VEHICLE, About, Attached, LogWriter, file_prefix
 from appliance.record.settings import RecordConfig
@@ -67,12 +68,12 @@ class Sequences:
         self._last: OrderedDict[tuple[str, str], tuple[int, int, int]] = OrderedDict()
         """The last number of each, the last one that came behind it, and how many of those came in a row."""
         self._kinds = (
-            (compile_expression(keys.transition()), "transition"),
-            (compile_expression(keys.run()), "run"),
-            (compile_expression(keys.log()), "log"),
-            # Not of what is sent: each other end is told a part of it.
-            (compile_expression(keys.mavlink(direction="rx")), "mavlink"),
-            (compile_expression(keys.link_frames(direction="rx")), "mavlink"),
+            (compile_expression(keys(keyspace.TRANSITION)), "transition"),
+            (compile_expression(keys(keyspace.RUN_EVENT)), "run"),
+            (compile_expression(keys(keyspace.LOG)), "log"),
+            # Not of what is sent: each peer gets a part of it.
+            (compile_expression(keys(keyspace.MAVLINK, "*", "rx")), "mavlink"),
+            (compile_expression(keys(keyspace.LINK_FRAMES, "*", "*", "rx")), "mavlink"),
         )
         self.missing: dict[str, int] = {}
         """Messages not heard so far, by kind."""
@@ -95,7 +96,7 @@ class Sequences:
         if number < 0:
             return None
         last = self._note((key, source), number)
-        # A new coordinator goes on from a record, a new process counts anew: neither is a hole.
+        # A new coordinator goes on from a record, a new process counts from the start: neither is a hole.
         if last is None or number <= last + 1:
             return None
         return self._hole(kind, number - last - 1, key)
@@ -113,7 +114,7 @@ class Sequences:
         if last < 0 or 0 < ahead <= _WINDOW // 2:
             self._note(source, number)
             return self._hole("mavlink", ahead - 1, key) if last >= 0 and ahead > 1 else None
-        # Behind: one that was overtaken, or is told again; or its speaker has begun again, as some in a row show.
+        # Behind: one that was overtaken, or is repeated; or its speaker has begun again, as some in a row show.
         run = run + 1 if number == (late + 1) % _WINDOW else 1
         if run < _RESTARTED:
             self._note(source, last, late=number, run=run)
@@ -135,7 +136,7 @@ class Sequences:
 
 
 MOST_KEYS = 50_000
-"""Keys whose plan is remembered; beyond, all are worked out anew. Each task has some of its own."""
+"""Keys whose plan is remembered; beyond, all are worked out each time. Each task has some of its own."""
 _PLAN = b'"plan"'
 
 
@@ -187,8 +188,10 @@ class Pipeline:
         self._triggers = Triggers(keys, config.name)
         self._clock = clock
         self._ways: dict[str, _Way] = {}
-        self._raw = tuple(map(compile_expression, (keys.mavlink(), keys.link_frames(), keys.camera())))
-        self._transitions = compile_expression(keys.transition())
+        self._raw = tuple(
+            map(compile_expression, (keys(keyspace.MAVLINK), keys(keyspace.LINK_FRAMES), keys(keyspace.CAMERA)))
+        )
+        self._transitions = compile_expression(keys(keyspace.TRANSITION))
 
     def write(self, message: LoggedMessage) -> None:
         """Take a message on its way."""
@@ -420,7 +423,7 @@ class Recorder:
         self._thread.start()
         self._catching_up.start()
         self._subscription = await asyncio.to_thread(
-            self._session.flood, self._session.keys.everything(), LoggedMessage, self._catching_up.take
+            self._session.flood, self._session.keys.everything, LoggedMessage, self._catching_up.take
         )
         self._reporting = asyncio.create_task(self._report(), name="recorder status")
         log.info("recorder started", directory=str(self._config.folder), fleet=self._session.keys.fleet)
@@ -540,7 +543,7 @@ class Recorder:
             await asyncio.sleep(self._config.status_s)
 
     def _publish(self) -> None:
-        self._session.put(self._session.keys.recorder_status(self._config.name), encode(self.stats))
+        self._session.publish(keyspace.RECORDER_STATUS, self.stats, self._config.name)
 
 
 async def run_recorder(

@@ -12,27 +12,29 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 
 from appliance.errors import RefusedError
-from appliance.model import encode
-from appliance.plane.keys import Keys
+from appliance.model import keyspace
+from appliance.model.keys import Keys, fleet_and_rest
+from appliance.model.recorder_api import RecorderStatus, Trigger
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.record.incidents import EVERY
-from appliance.record.models import RecorderStatus, Trigger
 from appliance.record.player import Played, Player, PlayOptions
 
 JUMP_S = 5.0
 SETTLE_S = 0.3
-"""How long whoever listens is given to link before the first message."""
+"""How long listeners are given to link before the first message."""
 _LEFT, _RIGHT = b"\x1b[D", b"\x1b[C"
 
 
-async def trigger(fleet: str, connect: tuple[str, ...], reason: str, *, by: str, wait_s: float) -> list[RecorderStatus]:
+async def trigger(
+    fleet: str, connect: tuple[str, ...], reason: str, *, by: str, wait_s: float, keys: str = ""
+) -> list[RecorderStatus]:
     """Tell all recorders of a fleet that something is worth keeping; returns the accounts of those that confirm it.
 
     Raises:
         UnreachableError: the fleet cannot be joined.
     """
-    session = await Session.open(PlaneConfig(mode="client", connect=connect), fleet)
+    session = await Session.open(PlaneConfig(mode="client", connect=connect, keys=keys), fleet)
     before: dict[str, int] = {}
     confirmed: dict[str, RecorderStatus] = {}
     heard, done = asyncio.Event(), asyncio.Event()
@@ -47,11 +49,11 @@ async def trigger(fleet: str, connect: tuple[str, ...], reason: str, *, by: str,
                 done.set()
 
     try:
-        session.subscribe_typed(session.keys.recorder_status(), RecorderStatus, take)
+        session.subscribe_typed(keyspace.RECORDER_STATUS, take)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(wait_s):
                 await heard.wait()
-        session.put(session.keys.recorder_trigger(EVERY), encode(Trigger(reason=reason, by=by)))
+        session.publish(keyspace.RECORDER_TRIGGER, Trigger(reason=reason, by=by), EVERY)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(wait_s):
                 await done.wait()
@@ -101,8 +103,8 @@ async def replay(
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, player.stop)
         await asyncio.sleep(SETTLE_S)
-        for each in {fleet, *(new.split("/")[1] for _, new in options.remap if new.startswith("swiftbot/"))}:
-            if members := await session.alive_now(Keys(each).alive()):
+        for each in ({fleet} | {fleet_and_rest(f"{new}/")[0] for _, new in options.remap}) - {""}:
+            if members := await session.alive_now(Keys(each)(keyspace.GATEWAY_ALIVE)):
                 raise RefusedError(
                     f"fleet {each} is at work ({len(members)} gateways): what is replayed would be taken for its own",
                     remedy="replay onto a fleet of another name, with --as",

@@ -82,9 +82,9 @@ def pin(path: Path, *, pinned: bool) -> None:
         NotFoundError: no such file.
         RecordError: its folder cannot be written.
     """
-    if not path.is_file():
-        raise NotFoundError(f"no log file {path}", remedy="`swiftbot log info FILE` tells what is in one")
     try:
+        if not path.is_file():
+            raise NotFoundError(f"no log file {path}", remedy="`swiftbot log info FILE` tells what is in one")
         if pinned:
             pin_of(path).touch()
         else:

@@ -12,32 +12,17 @@ Pure functions.
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, cast
 
 import msgspec
 from msgspec import Struct
 
-from appliance.model import (
-    Act,
-    ContainerInfo,
-    Enquiry,
-    GatewayStatus,
-    Lease,
-    Lifted,
-    LogLine,
-    Notice,
-    RobotCommand,
-    RobotInfo,
-    RunEvent,
-    Site,
-    SoftStop,
-    TaskRecord,
-    TaskRequest,
-)
+from appliance.errors import PayloadError
+from appliance.model import LogLine, Notice, RobotInfo, Site, keyspace
+from appliance.model.keys import Keys, Untyped
 from appliance.model.site import to_globe
-from appliance.plane.keys import Keys
-from appliance.record.models import Deletion, Gap, Incident, LoggedMessage, RecorderStatus, Trigger, compile_expression
+from appliance.record.models import LoggedMessage, compile_expression
 
 JsonSchema = dict[str, Any]
 SITE_FRAME = "site"
@@ -230,10 +215,12 @@ class Foxglove:
         self._keys = keys
         self._recorder = recorder
         self._site = site
+        self._topics_of = lru_cache(maxsize=1024)(self._topics)
+        """A robot says where it is ten times a second: its channels' names are made once."""
         self._makers: tuple[tuple[Any, Derive], ...] = (
-            (compile_expression(keys.log()), self._of_line),
-            (compile_expression(keys.notice()), self._of_notice),
-            (compile_expression(keys.robot()), self._of_robot),
+            (compile_expression(keys(keyspace.LOG)), self._of_line),
+            (compile_expression(keys(keyspace.NOTICE)), self._of_notice),
+            (compile_expression(keys(keyspace.ROBOT)), self._of_robot),
         )
 
     def deriving(self, key: str) -> Derive | None:
@@ -259,19 +246,24 @@ class Foxglove:
 
     def _news(self, at_ns: int, level: int, text: str, name: str) -> tuple[Derived, ...]:
         made = FoxgloveLog(time_of(at_ns), level, text, name)
-        return (Derived(self._keys.recorder_log(self._recorder), LOG_KIND, msgspec.json.encode(made)),)
+        return (Derived(self._keys(keyspace.RECORDER_LOG, self._recorder), LOG_KIND, msgspec.json.encode(made)),)
+
+    def _topics(self, robot: str) -> dict[str, str]:
+        """Names of a robot's channels by what they show; PayloadError for a name that cannot be in a key."""
+        return {what: self._keys(keyspace.RECORDER_VIEW, self._recorder, robot, what) for what in _OF_VIEW}
 
     def _of_robot(self, message: LoggedMessage) -> tuple[Derived, ...]:
+        # By the key, not by what the payload says of itself: one who lies about its id moves nobody else.
+        (name,) = keyspace.ROBOT.names(message.key)
         try:
             robot = msgspec.json.decode(message.payload, type=RobotInfo)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            return ()
+            topics = self._topics_of(name)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, PayloadError):
+            return ()  # the last: a stranger's put under a name that cannot be in a key of ours
         pose = robot.pose
         if pose is None or not all(map(math.isfinite, (pose.x, pose.y, pose.z, pose.heading_deg))):
             return ()
         at, position, rotation = time_of(message.at_ns), Vector(pose.x, pose.y, pose.z), facing(pose.heading_deg)
-        # By the key, not by what the payload says of itself: one who lies about its id moves nobody else.
-        name = message.key.split("/")[3]
         made: list[tuple[str, ChannelKind, Struct]] = [
             ("pose", POSE_KIND, PoseInFrame(at, SITE_FRAME, PlacedPose(position, rotation))),
             ("transform", TRANSFORM_KIND, FrameTransform(at, SITE_FRAME, name, position, rotation)),
@@ -280,10 +272,7 @@ class Foxglove:
             made.append(
                 ("location", LOCATION_KIND, LocationFix(at, name, *to_globe(self._site, pose.x, pose.y, pose.z)))
             )
-        return tuple(
-            Derived(self._keys.recorder_view(self._recorder, name, what), kind, msgspec.json.encode(value))
-            for what, kind, value in made
-        )
+        return tuple(Derived(topics[what], kind, msgspec.json.encode(value)) for what, kind, value in made)
 
 
 def flat_schema(kind: type[Struct]) -> JsonSchema:
@@ -325,14 +314,48 @@ PLAIN_JSON = ChannelKind("", b"", "json")
 
 def mavlink_kind(direction: str) -> ChannelKind:
     """Return how raw frames of one direction are logged: MCAP has no schema for them, so the metadata says it."""
-    told = {"dialect": MAVLINK_DIALECT, "direction": direction if direction != "*" else "other"}
+    told = {"dialect": MAVLINK_DIALECT, "direction": direction if direction in ("rx", "tx") else "other"}
     return ChannelKind("", b"", "mavlink", tuple(told.items()))
 
 
-def _outline(name: str, **properties: str) -> ChannelKind:
-    """A kind whose struct belongs to a room above: the fields that are always there, and whatever else comes."""
-    schema = {"title": name, "type": "object", "properties": {key: {"type": kind} for key, kind in properties.items()}}
-    return ChannelKind(f"swiftbot.{name}", msgspec.json.encode(schema), "json")
+_EXCHANGE = _kind(
+    _object(
+        "swiftbot.Exchange", "What a gateway was asked and answered", verb=_STRING, gateway=_STRING, duration_ms=_NUMBER
+    )
+)
+"""Request and reply are JSON of any form."""
+_SIMPLE = ("string", "integer", "number", "boolean")
+
+
+@cache
+def _short_kind(kind: type[Struct]) -> ChannelKind:
+    """How a struct is logged whose whole schema would be larger than most logs: with its simple fields alone."""
+    whole = flat_schema(kind)
+    fields = {name: part for name, part in whole["properties"].items() if part.get("type") in _SIMPLE}
+    return ChannelKind(f"swiftbot.{kind.__name__}", msgspec.json.encode(whole | {"properties": fields}), "json")
+
+
+_OF_VIEW = {"pose": POSE_KIND, "transform": TRANSFORM_KIND, "location": LOCATION_KIND}
+
+
+def _kind_of(key: str) -> ChannelKind | None:
+    """How what is put on a key of ours is logged; None where that is not JSON of one form."""
+    topic = keyspace.topic_of(key)
+    if topic is None or topic.form in ("query", "token"):
+        return None
+    if topic is keyspace.MAVLINK or topic is keyspace.LINK_FRAMES:
+        return mavlink_kind(topic.names(key)[-1])
+    if topic is keyspace.TRANSITION:
+        return _short_kind(topic.payload)
+    if topic is keyspace.EXCHANGE:
+        return _EXCHANGE
+    if topic is keyspace.CAMERA:
+        return IMAGE_KIND
+    if topic is keyspace.RECORDER_LOG:
+        return LOG_KIND
+    if topic is keyspace.RECORDER_VIEW:
+        return _OF_VIEW.get(topic.names(key)[-1])
+    return None if issubclass(topic.payload, Untyped) else struct_kind(topic.payload)
 
 
 class KeySchemas:
@@ -340,68 +363,13 @@ class KeySchemas:
 
     def __init__(self, keys: Keys) -> None:
         self.keys = keys
-        typed: list[tuple[str, ChannelKind]] = [
-            (keys.status(), struct_kind(GatewayStatus)),
-            (keys.container(), struct_kind(ContainerInfo)),
-            (keys.log(), struct_kind(LogLine)),
-            (keys.task(), struct_kind(TaskRecord)),
-            (
-                keys.transition(),
-                _outline(
-                    "Transition",
-                    task="string",
-                    sequence="integer",
-                    kind="string",
-                    at_ns="integer",
-                    coordinator="string",
-                    subtask="string",
-                    attempt="integer",
-                    gateway="string",
-                    note="string",
-                ),
-            ),
-            (
-                keys.transfer(),
-                _outline("Transfer", what="string", state="string", done_bytes="number", size_bytes="number"),
-            ),
-            (keys.exchange(), _outline("Exchange", verb="string", gateway="string", duration_ms="number")),
-            (keys.run(), struct_kind(RunEvent)),
-            (keys.robot(), struct_kind(RobotInfo)),
-            (keys.commanded(), struct_kind(RobotCommand)),
-            (keys.camera(), IMAGE_KIND),
-            *(
-                (expression, mavlink_kind(each))
-                for each in ("rx", "tx", "*")
-                for expression in (keys.mavlink(direction=each), keys.link_frames(direction=each))
-            ),
-            (keys.act(), struct_kind(Act)),
-            (keys.soft_stop(), struct_kind(SoftStop)),
-            (keys.lifted(), struct_kind(Lifted)),
-            (keys.lease(), struct_kind(Lease)),
-            (keys.enquiry(), struct_kind(Enquiry)),
-            *((keys.link_frames(direction=each), mavlink_kind(each)) for each in ("rx", "tx", "*")),
-            (keys.intake(), struct_kind(TaskRequest)),
-            (keys.notice(), struct_kind(Notice)),
-            (keys.recorder_status(), struct_kind(RecorderStatus)),
-            (keys.recorder_trigger(), struct_kind(Trigger)),
-            (keys.recorder_incident("*"), struct_kind(Incident)),
-            (keys.decided(), _outline("Decided", task="string", subtask="string")),
-            (keys.recorder_gap("*"), struct_kind(Gap)),
-            (keys.recorder_deleted("*"), struct_kind(Deletion)),
-            (keys.recorder_log("*"), LOG_KIND),
-            (keys.recorder_view("*", "*", "pose"), POSE_KIND),
-            (keys.recorder_view("*", "*", "transform"), TRANSFORM_KIND),
-            (keys.recorder_view("*", "*", "location"), LOCATION_KIND),
-        ]
-        self._typed = [(compile_expression(expression), kind) for expression, kind in typed]
 
     def kind_of(self, key: str, encoding: str) -> ChannelKind:
         """Return how messages of `key`, put with Zenoh encoding `encoding`, are described in a log."""
-        for pattern, kind in self._typed:
-            if pattern.fullmatch(key):
-                if kind.encoding == "json" and not _is_json(encoding):
-                    break  # a stranger's put: keep it, but do not call it what it is not
-                return kind
+        kind = _kind_of(key)
+        # A stranger's put on a key of ours is kept, but not called what it is not.
+        if kind is not None and (kind.encoding != "json" or _is_json(encoding)):
+            return kind
         if _is_json(encoding):
             return PLAIN_JSON
         return ChannelKind("", b"", encoding.partition(";")[0] or "application/octet-stream")

@@ -24,11 +24,12 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import RecordError
-from appliance.model import Site
+from appliance.model import Site, keyspace
+from appliance.model.keys import Keys
+from appliance.model.recorder_api import Deletion, Gap, Incident
 from appliance.plane.backlog import UNKNOWN, kind_of
-from appliance.plane.keys import Keys
 from appliance.record.mcap_writer import LogFile, McapFile, free_bytes
-from appliance.record.models import Deletion, Gap, Incident, LoggedMessage
+from appliance.record.models import LoggedMessage
 from appliance.record.redact import LEAST_SECRET, Redactor, known_secrets, without_secrets
 from appliance.record.retention import make_room
 from appliance.record.schemas import ChannelKind, Derive, Foxglove, KeySchemas
@@ -120,7 +121,7 @@ class OpenLog:
         at_ns = message.at_ns if 0 < message.at_ns <= LAST_NS else now_ns
         if message.deleted:
             deletion = msgspec.json.encode(Deletion(key=message.key, at_ns=at_ns))
-            self.put(self._keys.recorder_deleted(self._config.name), at_ns, deletion)
+            self.put(self._keys(keyspace.RECORDER_DELETED, self._config.name), at_ns, deletion)
             return
         channel = self._channels.get((message.key, message.encoding))
         if channel is None:
@@ -136,13 +137,13 @@ class OpenLog:
         """Write down what is missing."""
         self.gaps.append(gap)  # comes back into the books when the file fails before it is whole
         at_ns = gap.until_ns if 0 < gap.until_ns <= LAST_NS else now_ns
-        self.put(self._keys.recorder_gap(self._config.name), at_ns, msgspec.json.encode(gap))
+        self.put(self._keys(keyspace.RECORDER_GAP, self._config.name), at_ns, msgspec.json.encode(gap))
 
     def add_incident(self, incident: Incident, *, now_ns: int) -> None:
         """Write down what happened."""
         self.marks.append(incident)  # waits for room again when the file fails before it is whole
         at_ns = incident.at_ns if 0 < incident.at_ns <= LAST_NS else now_ns
-        self.put(self._keys.recorder_incident(self._config.name), at_ns, msgspec.json.encode(incident))
+        self.put(self._keys(keyspace.RECORDER_INCIDENT, self._config.name), at_ns, msgspec.json.encode(incident))
 
     def put(self, topic: str, at_ns: int, payload: bytes, *, kind: ChannelKind | None = None) -> None:
         """Write a message of the recorder's own; with a `kind`: one that was derived from another."""
@@ -377,7 +378,7 @@ class LogWriter:
     def miss(self, source: str, count: int, key: str, at_ns: int, *, keys: Mapping[str, int] | None = None) -> None:
         """Count messages that never came here; told in the log as those that were dropped are.
 
-        Frames of a vehicle (source `mavlink`) were lost on its link, before the fleet had them: the gap is told, and
+        Frames of a vehicle (source `mavlink`) were lost on its link, before the fleet had them: the gap is logged, and
         nothing of the fleet's is missing.
         """
         self.not_heard[source] = self.not_heard.get(source, 0) + count
@@ -473,7 +474,7 @@ class LogWriter:
         if len(self._marks) < MOST_MARKS:
             self._marks.append(incident)
         else:
-            self.drop(self._reason, self._schemas.keys.recorder_incident(self.config.name), 0, incident.at_ns)
+            self.drop(self._reason, self._schemas.keys(keyspace.RECORDER_INCIDENT, self.config.name), 0, incident.at_ns)
 
     def _ready(self) -> OpenLog | None:
         """Return the file to write in, opening one when it is time; None while there is no space."""
@@ -604,7 +605,7 @@ MOST_SECRET_FILE_BYTES = 4096
 
 
 class About(Struct, frozen=True, kw_only=True):
-    """What a recorder is told beside its settings: what logs are understood by, and what must not be in them."""
+    """What a recorder needs beside its settings: what logs are understood by, and what must not be in them."""
 
     site: Site | None = None
     """Where the fleet is on the globe."""

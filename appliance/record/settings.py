@@ -9,7 +9,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from appliance.errors import ConfigError, PayloadError
-from appliance.plane.keys import check_name
+from appliance.model.keys import check_name
 
 
 class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -17,6 +17,8 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     directory: str = "/var/lib/swiftbot/log"
     """Where the log files go; made when absent."""
+    keys: str = ""
+    """File with the recorder's keys (`swiftbot keys issue recorder NAME`); empty: the gateway's, `plane.keys`."""
     mode: str = "all"
     """`all`: everything is written. `incidents`: the last `before_s` seconds are held in memory and written when
     something goes wrong (a task fails, a failsafe, a soft stop, `swiftbot log trigger`), with what follows. For a site
@@ -30,7 +32,7 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     device_name: str = ""
     """By which Foxglove files recordings; empty: fleet and recorder's name."""
     device_id: str = ""
-    """Foxglove's own id of the device (`dev_...`), where it has been given one; empty: the name alone is told."""
+    """Foxglove's own id of the device (`dev_...`), where it has been given one; empty: only the name is given."""
     name: str = "recorder"
     """The recorder's name on the network and in file names; different for each recorder of a fleet."""
     chunk_bytes: int = 64 * 1024

@@ -18,7 +18,7 @@ import msgspec
 from msgspec import Struct
 
 from appliance.errors import DeadlineError, RobotError, SwiftbotError, UnreachableError
-from appliance.model import Pose, RobotCommand, RobotInfo, RobotReply, encode
+from appliance.model import Pose, RobotCommand, RobotInfo, RobotReply, encode, keyspace
 from appliance.model.robots import plausible, read_robot
 from appliance.plane.session import Session
 from appliance.robots.executor import UNREADABLE
@@ -256,7 +256,9 @@ async def is_present(session: Session, robot: str) -> bool:
     another subscription of the same session is being told of at that moment (Zenoh 1.10).
     """
     there = asyncio.Event()
-    watch = session.watch_alive(session.keys.robot_alive(robot), lambda _, alive: there.set() if alive else None)
+    watch = session.watch_alive(
+        session.keys(keyspace.ROBOT_ALIVE, robot), lambda _, alive: there.set() if alive else None
+    )
     try:
         async with asyncio.timeout(PRESENT_S):
             await there.wait()
@@ -321,7 +323,7 @@ class Conformance:
             SwiftbotError: the fleet does not let the robot be taken over.
         """
         told = self._session.subscribe(
-            self._session.keys.robot(self._robot),
+            self._session.keys(keyspace.ROBOT, self._robot),
             lambda message: None if message.deleted else self._told.append((time.monotonic(), message.payload)),
         )
         try:
@@ -388,7 +390,9 @@ class Conformance:
         reply: RobotReply | None = None
         error: SwiftbotError | None = None
         try:
-            data = await self._session.query(self._session.keys.command(self._robot), payload, timeout_s=timeout_s)
+            data = await self._session.query(
+                self._session.keys(keyspace.COMMAND, self._robot), payload, timeout_s=timeout_s, sign=True
+            )
             reply = msgspec.json.decode(data, type=RobotReply)
             if id_ and reply.id != id_:
                 error = RobotError(f"a reply to {reply.id[:60]!r} came for {id_!r}")
@@ -410,7 +414,7 @@ class Conformance:
 
     async def _present(self) -> str:
         if not await is_present(self._session, self._robot):
-            key = self._session.keys.robot_alive(self._robot)
+            key = self._session.keys(keyspace.ROBOT_ALIVE, self._robot)
             raise Fault("it holds no liveliness token", f"declare one on {key} while it runs")
         return "holds its liveliness token"
 
@@ -423,7 +427,9 @@ class Conformance:
         if self._info is None:
             raise Skipped("it puts no state that can be read")
         asked = encode(RobotCommand(id=self._id(), verb="state"))
-        count = await self._session.answerers(self._session.keys.command(self._robot), asked, timeout_s=AT_ONCE_S)
+        count = await self._session.answerers(
+            self._session.keys(keyspace.COMMAND, self._robot), asked, timeout_s=AT_ONCE_S
+        )
         return judge_speaker([payload for _, payload in self._told], max(1, count))
 
     async def _answers(self) -> str:

@@ -14,23 +14,23 @@ the same command id. An entry is written before the robot moves and completed be
 Rules (pure, `IdempotencyLog.decide`):
 1. a lower attempt than was seen of that task and subtask is refused: its coordinator has given up on it;
 2. an id under way is joined, an id that succeeded is answered with the stored reply;
-3. an id that failed is answered the same to the same attempt, and done anew for a higher one;
-4. an id taken up before a restart of whoever serves the robot, without an outcome, is resumed where the verb is a
-   goal (going somewhere, being landed) and answered as unknown where it is an act (picking, recording).
+3. an id that failed is answered the same to the same attempt, and done again for a higher one;
+4. an id taken up before a restart of the process that serves the robot, without an outcome, is resumed where the verb
+   is a goal (going somewhere, being landed) and answered as unknown where it is an act (picking, recording).
 """
 
 import asyncio
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from enum import Enum, auto
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 import structlog
 from msgspec import Struct, field
 
 from appliance.errors import DeadlineError, PayloadError, SwiftbotError, UnreachableError
-from appliance.model import Failure, RobotCommand, RobotReply, encode
+from appliance.model import Failure, RobotCommand, RobotReply, encode, keyspace
 from appliance.plane.session import Session
 from appliance.robots.retry import LONG_POLL_S
 from appliance.robots.verbs import RobotFailure, StopArgs, args_of, parse_args
@@ -169,7 +169,7 @@ class IdempotencyLog:
     def _overflow(self) -> list[str]:
         """Drop the oldest entries over the bounds, never the newest; return their ids.
 
-        One that is still under way may go too: whoever executes it knows it, and its outcome makes a new entry.
+        One that is still under way may go too: its executor knows it, and its outcome makes a new entry.
         """
         dropped: list[str] = []
         while len(self._entries) > 1 and (len(self._entries) > self._limit or self._blob_bytes > MAX_BLOB_BYTES):
@@ -210,6 +210,63 @@ class Verb(Struct, frozen=True, kw_only=True):
     """A goal that may be taken up again after a restart; not an act that may have happened already."""
     preempts: bool = False
     """Ends what its actuators do instead of being refused as busy."""
+
+
+M = TypeVar("M", bound=Callable[..., Awaitable[Done]])
+
+
+class Terms(Struct, frozen=True, kw_only=True):
+    """How the method that bears its name carries out a verb; the rest as of `Verb`."""
+
+    uses: tuple[str, ...] = ("base",)
+    resumable: bool = True
+    preempts: bool = False
+    guarded: bool = True
+    """Refused while somebody else has the robot."""
+    safe: bool = False
+    """Not refused while a failsafe has it, being what a failsafe would do."""
+    flying: bool = False
+    """For robots that fly alone."""
+
+
+_TERMS: dict[object, Terms] = {}
+
+
+def verb(terms: Terms = Terms()) -> Callable[[M], M]:  # noqa: B008 - frozen
+    """Make a method `(args) -> Done` what carries out the verb of its name (`verbs_of` finds it)."""
+
+    def register(method: M) -> M:
+        _TERMS[method] = terms
+        return method
+
+    return register
+
+
+def verbs_of(*parts: object, check: Callable[[bool], None], flies: bool) -> dict[str, Verb]:
+    """Return the verbs that the methods of some parts of a robot carry out.
+
+    Args:
+        parts: objects with methods that are marked by `verb`.
+        check: raises RobotFailure while somebody else has the robot; gets whether the verb is a safe one.
+        flies: whether it flies.
+    """
+    found: dict[str, Verb] = {}
+    for part in parts:
+        for name, method in vars(type(part)).items():
+            terms = _TERMS.get(method)
+            if terms is not None and (flies or not terms.flying):
+                found[name] = _verb(getattr(part, name), terms, check)
+    return found
+
+
+def _verb(run: Callable[[Any], Awaitable[Done]], terms: Terms, check: Callable[[bool], None]) -> Verb:
+    async def guarded(args: object) -> Done:
+        check(terms.safe)
+        return await run(args)
+
+    return Verb(
+        run=guarded if terms.guarded else run, uses=terms.uses, resumable=terms.resumable, preempts=terms.preempts
+    )
 
 
 class _Running:
@@ -286,7 +343,7 @@ class CommandExecutor:
 
     async def _decide(self, command: RobotCommand) -> RobotReply:
         if self._closing:
-            raise UnreachableError(f"whoever serves {self.robot} is stopping", remedy="ask again")
+            raise UnreachableError(f"the server of {self.robot} is stopping", remedy="ask again")
         kind = args_of(command.verb)
         verb = self.verbs.get(command.verb)
         if kind is None or (verb is None and command.verb != "stop"):
@@ -316,7 +373,7 @@ class CommandExecutor:
         if verdict is Verdict.INTERRUPTED and not verb.resumable:
             raise RobotFailure(
                 "robot",
-                f"{command.verb} was under way when whoever serves {self.robot} restarted; its outcome is unknown",
+                f"{command.verb} was under way when the server of {self.robot} restarted; its outcome is unknown",
                 remedy="look at the robot, then give a new command",
             )
         return await self._start(command, verb, kind, announce=verdict is Verdict.NEW)
@@ -397,7 +454,7 @@ class CommandExecutor:
         except TimeoutError:
             raise DeadlineError(f"{running.command.verb} is still under way", remedy="ask again, same id") from None
         if reply is None:
-            raise UnreachableError(f"whoever serves {self.robot} is stopping", remedy="ask again, same id")
+            raise UnreachableError(f"the server of {self.robot} is stopping", remedy="ask again, same id")
         return reply
 
     async def _stop(self, command: RobotCommand) -> RobotReply:
@@ -416,7 +473,7 @@ class CommandExecutor:
         await self._end(list(self._running.values()), failure)
 
     async def close(self) -> None:
-        """End every command without an outcome; callers are told to ask again, and the log keeps them open."""
+        """End every command without an outcome; callers have to ask again, and the log keeps them open."""
         self._closing = True
         await self._end(list(self._running.values()), None)
 
@@ -428,7 +485,7 @@ class CommandExecutor:
             await asyncio.wait(tasks)
 
     def _announce(self, command: RobotCommand) -> None:
-        self._session.put(self._session.keys.commanded(self.robot), encode(command))
+        self._session.publish(keyspace.COMMANDED, command, self.robot)
 
     def _count(self, what: str) -> None:
         self._refused[what] = self._refused.get(what, 0) + 1

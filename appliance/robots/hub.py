@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import structlog
 
 from appliance.errors import NotFoundError, RefusedError
-from appliance.model import RobotCommand, RobotInfo, Site, TaskRequest
+from appliance.model import RobotCommand, RobotInfo, Site, TaskRequest, keyspace
+from appliance.model.robot_api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk, RobotForget
 from appliance.plane.session import Session
-from appliance.robots.api import Forgotten, LinkAdd, LinkFacts, LinkList, LinkRemove, LinksAsk, RobotForget
 from appliance.robots.executor import KeyValues
 from appliance.robots.settings import RobotsConfig
 from appliance.robots.task_listener import TaskListener, Tasks
 
 if TYPE_CHECKING:
-    from appliance.robots.mavlink.vehicle_manager import VehicleManager
+    from appliance.robots.mavlink.node import MavlinkNode
 
 
 log = structlog.get_logger(__name__)
@@ -57,30 +57,30 @@ class RobotHub:
         self.refused: dict[str, int] = {}
         submit = None if tasks is None else tasks.submit_of
         self._intake = None if on_task is None else TaskListener(session, on_task, self.refused, submit=submit)
-        self._vehicles: VehicleManager | None = None
+        self._mavlink: MavlinkNode | None = None
         self._opening = asyncio.Lock()
 
     @property
     def attached(self) -> tuple[str, ...]:
         """Names of the MAVLink vehicles heard since start, online or not."""
-        return () if self._vehicles is None else self._vehicles.attached
+        return () if self._mavlink is None else self._mavlink.vehicles.attached
 
     async def start(self) -> None:
         """Bind the ports and begin; ConfigError with the remedy when a setting is wrong or a port taken."""
         self._config.check()
         if self._config.mavlink or await self._store.scan(ADDED_LINKS):
-            await self._open_vehicles()
+            await self._open_mavlink()
         if self._intake is not None:
             self._intake.start()
 
-    async def _open_vehicles(self) -> "VehicleManager":
+    async def _open_mavlink(self) -> "MavlinkNode":
         async with self._opening:
-            if self._vehicles is not None:
-                return self._vehicles
+            if self._mavlink is not None:
+                return self._mavlink
             # pymavlink's dialect costs 15 MB and 30 ms: only gateways with vehicles pay for it.
-            from appliance.robots.mavlink.vehicle_manager import VehicleManager  # noqa: PLC0415
+            from appliance.robots.mavlink.node import MavlinkNode  # noqa: PLC0415
 
-            vehicles = VehicleManager(
+            node = MavlinkNode(
                 self._config,
                 session=self._session,
                 store=self._store,
@@ -90,28 +90,28 @@ class RobotHub:
                 tasks=self._tasks,
                 gate=self._gate,
             )
-            await vehicles.start()
-            self._vehicles = vehicles
-            return vehicles
+            await node.start()
+            self._mavlink = node
+            return node
 
     # --- links at run time: the verbs robot_links, robot_link_add, robot_link_remove ---------------------------
 
     async def links(self, ask: LinksAsk) -> LinkList:
         """All MAVLink links of this gateway, and what went over them."""
         del ask
-        return LinkList(gateway=self._gateway) if self._vehicles is None else self._vehicles.link_list()
+        return LinkList(gateway=self._gateway) if self._mavlink is None else self._mavlink.link_list()
 
     async def add_link(self, ask: LinkAdd) -> LinkFacts:
         """Open a link and keep it over restarts; ConfigError or RefusedError when it cannot be."""
         ask.link.check()
-        vehicles = await self._open_vehicles()
-        return await vehicles.links.add(ask.link, by=ask.by)
+        node = await self._open_mavlink()
+        return await node.links.add(ask.link, by=ask.by)
 
     async def remove_link(self, ask: LinkRemove) -> LinkFacts:
         """Close a link for good; NotFoundError when there is none of that name."""
-        if self._vehicles is None:
+        if self._mavlink is None:
             raise NotFoundError(f"no MAVLink link {ask.url[:120]!r}", remedy="this gateway has none")
-        return await self._vehicles.links.remove(ask.url, by=ask.by)
+        return await self._mavlink.remove_link(ask.url, by=ask.by)
 
     async def forget(self, ask: RobotForget) -> Forgotten:
         """Remove the row of a robot that is offline, here and in every roster: the verb robot_forget.
@@ -125,12 +125,12 @@ class RobotHub:
         known = self._roster.get(name)
         if not mine and known is None:
             raise NotFoundError(f"no robot {name!r}", remedy="see `swiftbot robots`")
-        if (known is not None and known.online) or (self._vehicles is not None and self._vehicles.online(name)):
+        if (known is not None and known.online) or (self._mavlink is not None and self._mavlink.vehicles.online(name)):
             raise RefusedError(f"{name} is online", remedy="switch it off, or remove its link, first")
-        if self._vehicles is not None:
-            await self._vehicles.forget(name)
+        if self._mavlink is not None:
+            await self._mavlink.vehicles.forget(name)
         # A deleted key is what every roster knows a removed row by.
-        self._session.delete(self._session.keys.robot(name))
+        self._session.delete(self._session.keys(keyspace.ROBOT, name))
         log.info("robot forgotten", robot=name, by=ask.by[:120])
         return Forgotten(robot=name, gateway=self._gateway)
 
@@ -138,6 +138,6 @@ class RobotHub:
         """End commands (the next process resumes them), take back what was declared, close the ports."""
         if self._intake is not None:
             self._intake.stop()
-        if self._vehicles is not None:
-            await self._vehicles.stop()
-            self._vehicles = None
+        if self._mavlink is not None:
+            await self._mavlink.stop()
+            self._mavlink = None

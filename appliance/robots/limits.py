@@ -6,11 +6,11 @@ robots on the ground), altitude and speed limits. A command that breaks it is re
 moves, whatever plan, operator or handler asked for it.
 
 A MAVLink vehicle is held to its site last, in the gateway that commands it (`check_way` and the others). A robot that
-speaks Zenoh commands itself, and nobody knows whether it looks at anything: so whoever sends it an order on behalf of a
-task or of an operator holds the order to the site, and to what the robot said of itself when it registered. Limits that
-the configuration gives to robots (`[safety] limits`) hold for both kinds. What is above a bound is refused with the
-reason; speeds and take-off heights that nobody asked for, a skill's usual ones, are lowered to it. `Orders` puts the
-roster in; the rest is pure.
+speaks Zenoh commands itself, and nobody knows whether it looks at anything: so the gateway that sends it an order on
+behalf of a task or of an operator holds the order to the site, and to what the robot said of itself when it registered.
+Limits that the configuration gives to robots (`[safety] limits`) hold for both kinds. What is above a bound is refused
+with the reason; speeds and take-off heights that nobody asked for, a skill's usual ones, are lowered to it. `Orders`
+puts the roster in; the rest is pure.
 """
 
 import math
@@ -34,6 +34,7 @@ from appliance.robots.verbs import (
     TakeoffArgs,
     VelocityArgs,
     Waypoint,
+    args_of,
     in_range,
     parse_args,
 )
@@ -158,7 +159,7 @@ def check_speed(site: Site, speed_mps: float | None, *, verb: str = "goto") -> N
 
 
 LONGEST_MOVE_S = 1.0
-"""A robot that is moved by hand holds after so long unless it is told again: a person who is gone is noticed."""
+"""A robot that is moved by hand holds after so long without a new order: a person who is gone is noticed."""
 FASTEST_TURN_DPS = 120.0
 
 
@@ -251,6 +252,10 @@ class Usual(Struct, frozen=True, kw_only=True):
     takeoff_m: float = math.inf
 
 
+LIMITED = (GotoArgs, MissionArgs, OrbitArgs, TakeoffArgs, VelocityArgs)
+"""Arguments that say where to, how high or how fast: `held` looks at them."""
+
+
 class _Bound(Struct, frozen=True):
     value: float
     whose: str
@@ -290,15 +295,8 @@ def held(
     Raises:
         RobotFailure: `refused` with whose limit it breaks, `payload` when its arguments cannot be read.
     """
-    kinds: dict[str, type[Struct]] = {
-        "goto": GotoArgs,
-        "mission": MissionArgs,
-        "orbit": OrbitArgs,
-        "takeoff": TakeoffArgs,
-        "velocity": VelocityArgs,
-    }
-    kind = kinds.get(command.verb)
-    if kind is None:
+    kind = args_of(command.verb)
+    if kind is None or not issubclass(kind, LIMITED):
         return command
     args = parse_args(command.verb, command.args, kind)
     usual = usual or Usual()
@@ -325,8 +323,6 @@ def held(
             if site is not None:
                 _check_site(site, info, replace(args, speed_mps=changed.args.get("speed_mps")), begun=begun)
             return changed
-        case _:
-            return command
 
 
 def _strictest(bounds: Sequence[Bounds], key: str) -> _Bound | None:
@@ -480,7 +476,7 @@ def _verb(args: Struct) -> str:
 
 
 def _smaller(box: Box) -> Box:
-    """Return a box without its rim; a narrow one keeps its middle, or whoever stands at a wall would see none."""
+    """Return a box without its rim; a narrow one keeps its middle, or a robot that stands at a wall would see none."""
 
     def middle(low: float, high: float) -> tuple[float, float]:
         rim = max(0.0, min(STALE_M, (high - low - _CORE_M) / 2))

@@ -3,13 +3,13 @@
 A robot answers a command when it is done, and says at the latest after `LONG_POLL_S` that it is still under way; it is
 then asked again with the same id. What departs from that is bounded:
 
-- nobody takes the question, or whoever takes it drops it: asked again after 0.2 s, 0.4 s, ... (at most 2 s), given up
+- nobody takes the question, or it is taken and dropped: asked again after 0.2 s, 0.4 s, ... (at most 2 s), given up
   after `UNREACHABLE_S`;
 - the question is taken and nothing comes back: asked again after `FIRST_SILENCE_S`, then after twice that; the earlier
   questions stay open, an answer to any of them counts. Given up after `SILENT_S` without a word;
 - it says at once that it is under way: asked again after 0.2 s, 0.4 s, ... (at most 5 s), until the deadline;
 - it answers an earlier question while a later one is open: a robot that keeps its replies by id answers that one too.
-  Where the answer does not come within `CONFIRM_S` it is asked once more, and else it carries out the order anew.
+  Where the answer does not come within `CONFIRM_S` it is asked once more, and else it carries out the order again.
 """
 
 from enum import Enum, auto
@@ -17,7 +17,7 @@ from enum import Enum, auto
 from msgspec import Struct
 
 LONG_POLL_S = 10.0
-"""Longest that a question is held before whoever asked is told to ask again."""
+"""Longest that a question is held before the asker is asked to repeat it."""
 GRACE_S = 2.0
 """How much longer than that an answer is waited for."""
 FIRST_SILENCE_S = LONG_POLL_S + GRACE_S
@@ -38,13 +38,13 @@ class Ending(Enum):
     """Why a robot is not asked any more."""
 
     NOBODY = auto()
-    """Nobody took the questions, or whoever did dropped them."""
+    """Nobody took the questions, or they were taken and dropped."""
     SILENT = auto()
     """The questions were taken, and not a word came."""
     LATE = auto()
     """The command's own time is over."""
     FORGETFUL = auto()
-    """Asked again for what it has done, it does it anew."""
+    """Asked again for what it has done, it does it again."""
 
 
 class Ask(Struct, frozen=True):
@@ -76,7 +76,7 @@ class CommandRetry:
     Args:
         now: when it begins.
         timeout_s: how long the command may take.
-        live: whether each answer is made anew, so that two differ without having been done twice (`state`).
+        live: whether each answer is made afresh, so that two differ without having been done twice (`state`).
         chance: 0 to 1, taken off each wait in proportion to `JITTER`.
     """
 
@@ -132,7 +132,7 @@ class CommandRetry:
             self._quick = min(self._quick + 1, 16)
 
     def gone(self, number: int, now: float) -> None:
-        """Nobody took a question, or whoever did dropped it."""
+        """Nobody took a question, or it was taken and dropped."""
         sent = self._open.pop(number, now)
         if self._answered is not None:
             if number == self._confirming:  # it went away: what it remembers is not known, and its answer holds

@@ -1,7 +1,7 @@
 """Commands to robots: the caller's side. Asks until there is an answer, or until `retry` gives the robot up.
 
 `send_command` sends one command and waits for its end, `hold_robot` stops what a task has begun. `tell_to_hold`
-broadcasts the verb `stop`, which every robot answers: whoever carries out its commands ends them and halts.
+broadcasts the verb `stop`, which every robot answers: its executor ends its commands and halts.
 """
 
 import asyncio
@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterable
 import msgspec
 import structlog
 
+from appliance.background import Background
 from appliance.errors import ContractError, DeadlineError, RobotError, SwiftbotError, UnreachableError
-from appliance.model import Failure, RobotCommand, RobotReply, encode
+from appliance.model import Failure, RobotCommand, RobotReply, encode, keyspace
 from appliance.plane.session import Session
 from appliance.robots.executor import MAX_ID, UNREADABLE
 from appliance.robots.retry import Ask, CommandRetry, Done, End, Ending, Wait
@@ -24,8 +25,8 @@ _COUNT_S = 1.0
 _STOP_TIMEOUT_S = 3.0
 _PAST_END_S = 10.0
 _MAX_WHY = 300
-_stopping: set[asyncio.Task[None]] = set()
-"""Stops on their way, kept from the garbage collector."""
+_stopping = Background()
+"""Stops on their way: they outlive the call that gave the command."""
 
 
 async def send_command(
@@ -51,7 +52,7 @@ async def send_command(
 
     Raises:
         UnreachableError: nobody answers for the robot, and it is not there.
-        ContractError: it is there and does not answer, or does anew what it has done (docs/robot-contract.md).
+        ContractError: it is there and does not answer, or does again what it has done (docs/robot-contract.md).
         DeadlineError: the command did not end in `timeout_s` seconds.
         RobotError: the answer is no RobotReply.
         SwiftbotError: what else the answering side refused, such as PayloadError.
@@ -61,9 +62,7 @@ async def send_command(
     try:
         return await _ask_until(session, robot, command, timeout_s, on_silence)
     except (asyncio.CancelledError, DeadlineError, ContractError):
-        task = asyncio.get_running_loop().create_task(_send_stop(session, robot, command))
-        _stopping.add(task)
-        task.add_done_callback(_stopping.discard)
+        _stopping.start(_send_stop(session, robot, command), f"stop {command.id}")
         raise
 
 
@@ -72,7 +71,7 @@ async def _namesakes(session: Session, robot: str, command: RobotCommand) -> Rob
     if command.verb in ("state", "stop"):
         return None
     asked = RobotCommand(id=f"{command.id[:150]}~who", verb="state")
-    count = await session.answerers(session.keys.command(robot), encode(asked), timeout_s=_COUNT_S)
+    count = await session.answerers(session.keys(keyspace.COMMAND, robot), encode(asked), timeout_s=_COUNT_S)
     if count <= 1:
         return None
     session.refuse("namesake robot/*/command", robot=robot, answer=count)
@@ -89,7 +88,7 @@ async def _ask_until(
 ) -> RobotReply:
     """Ask as `Patience` says; what goes out and comes in is here, when and how often there."""
     loop = asyncio.get_running_loop()
-    key, payload = session.keys.command(robot), encode(command)
+    key, payload = session.keys(keyspace.COMMAND, robot), encode(command)
     live = command.verb in ("state", "stop")
     patience = CommandRetry(loop.time(), timeout_s, live=live, chance=random.random())  # noqa: S311 - no secret
     # A question stays open when the next one is sent: an answer to any of them will do.
@@ -107,7 +106,7 @@ async def _ask_until(
                     # Longer than the policy ever waits: a time that runs out is then the robot's word, not ours.
                     lasts_s = max(0.0, patience.deadline - now) + _PAST_END_S
                     number = patience.asked(now)
-                    open_[asyncio.create_task(session.query(key, payload, timeout_s=lasts_s))] = number
+                    open_[asyncio.create_task(session.query(key, payload, timeout_s=lasts_s, sign=True))] = number
                 case Wait(until):
                     left_s = max(0.0, until - now)
                     if not open_:
@@ -162,7 +161,7 @@ async def _given_up(
         remedy = "allow more time"
         if patience.said:
             remedy += (
-                f"; it said {patience.said} times that it is under way: if it begins anew each time, {_check_it(robot)}"
+                f"; it said {patience.said} times that it is under way: if it restarts each time, {_check_it(robot)}"
             )
         return DeadlineError(f"{robot} did not end {command.verb} within {timeout_s:g} s", remedy=remedy)
     if why is Ending.FORGETFUL:
@@ -170,7 +169,7 @@ async def _given_up(
             f"robot {robot} carries {command.verb} out again when it is asked again: it keeps no replies by command id",
             remedy=f"answer an id that is known with its reply; {_check_it(robot)}",
         )
-    if await session.alive_now(session.keys.robot_alive(robot)):
+    if await session.alive_now(session.keys(keyspace.ROBOT_ALIVE, robot)):
         return ContractError(
             f"robot {robot} did not answer {command.verb} for {silent_s:.0f} s (asked {times}), though it is online",
             remedy=f"restart its program; {_check_it(robot)}",
@@ -204,7 +203,7 @@ async def _send_stop(session: Session, robot: str, command: RobotCommand) -> Non
         command, id=f"{command.id[:150]}~stop{command.attempt}", verb="stop", args={"id": command.id}
     )
     try:
-        await session.query(session.keys.command(robot), encode(stop), timeout_s=_STOP_TIMEOUT_S)
+        await session.query(session.keys(keyspace.COMMAND, robot), encode(stop), timeout_s=_STOP_TIMEOUT_S, sign=True)
     except SwiftbotError as error:
         log.warning("stop not delivered", robot=robot, id=command.id, error=str(error))
 
@@ -232,7 +231,9 @@ async def tell_to_hold(
         command = RobotCommand(id=f"{act}~{robot}"[:200], verb="stop")
         async with room:
             try:
-                answer = await session.query(session.keys.command(robot), encode(command), timeout_s=timeout_s)
+                answer = await session.query(
+                    session.keys(keyspace.COMMAND, robot), encode(command), timeout_s=timeout_s, sign=True
+                )
                 reply = msgspec.json.decode(answer, type=RobotReply)
             except SwiftbotError as error:
                 return error.message

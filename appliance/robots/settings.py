@@ -7,99 +7,16 @@ Every figure that decides how long something is waited for is here and nowhere e
 
 import math
 import re
-from typing import Literal
-from urllib.parse import urlsplit
 
-from msgspec import Struct, field
+from msgspec import Struct
 
-from appliance.errors import ConfigError, PayloadError
-from appliance.plane.keys import check_name
+from appliance.errors import ConfigError
+from appliance.model.robot_api import MAX_SYSTEM, MavlinkLink, Remote
 
-MAX_SYSTEM = 255
 MAX_TEMPLATE = 500
 MAX_MISSION = 2000
 _PLACEHOLDER = re.compile(r"\{(.*?)\}")
 _KNOWN_PLACES = frozenset({"robot", *"234567"})
-
-
-DEFAULT_LISTEN = "udp://127.0.0.1:14550"
-"""14550 is where ground stations listen; loopback, since MAVLink frames are not authenticated."""
-
-
-class Remote(Struct, frozen=True):
-    """An address of MAVLink: listen there, or connect to it. Of a serial port `host` is its device, `port` its baud."""
-
-    scheme: Literal["udp", "tcp", "serial"]
-    host: str
-    port: int
-    listens: bool
-
-    def __str__(self) -> str:
-        if self.scheme == "serial":
-            return f"serial:{self.host}:{self.port}"
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.scheme}://{host}:{self.port}"
-
-
-class MavlinkLink(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One link on which vehicles are heard. `names` maps MAVLink system ids (as text) to robot names."""
-
-    listen: str = ""
-    """`udp://host:port` or `tcp://host:port` to listen on. With neither `listen` nor `connect`: udp://127.0.0.1:14550."""
-    connect: str = ""
-    """The same to connect to, again and again while nobody is there: a vehicle, SITL or a router that listens. Or
-    `serial:/dev/ttyUSB0:57600`, a serial port and its baud, which may be unplugged and plugged in again."""
-    signing: str = ""
-    """File with the link's MAVLink 2 signing key, readable by this user alone: a passphrase, or `hex:` and 64 digits;
-    `credential:NAME` for one that systemd hands over. Set, every frame sent is signed and frames that are unsigned,
-    wrongly signed or replayed are refused. Empty: no signing, and signed frames are refused."""
-    mavlink1: bool = False
-    """Send MAVLink 1 alone, to an old radio or autopilot that understands no other; both are always understood. What
-    MAVLink 1 has no message for (TUNNEL, gimbal managers, ...) is then not sent, and counted. Not with `signing`."""
-    only_in: tuple[str, ...] = ()
-    """Messages by name (`ATTITUDE`, ...) or number heard here that may go on to other links; none: all."""
-    not_in: tuple[str, ...] = ()
-    """But not these."""
-    only_out: tuple[str, ...] = ()
-    """Messages of other links that may be sent here; none: all. A slow radio wants few."""
-    not_out: tuple[str, ...] = ()
-    """But not these."""
-    names: dict[str, str] = field(default_factory=dict[str, str])
-    prefix: str = "drone_"
-    """Name of a vehicle not in `names`: prefix and system id. Empty: such vehicles are refused."""
-
-    @property
-    def remote(self) -> Remote:
-        """Where the link is; ConfigError when it is not understood, or to be both listened on and connected to."""
-        if self.listen and self.connect:
-            raise ConfigError(
-                f"robots.mavlink: a link both listens on {self.listen} and connects to {self.connect}",
-                remedy="write two links",
-            )
-        return read_remote(self.connect or self.listen or DEFAULT_LISTEN, listens=not self.connect)
-
-    def name_of(self, system: int) -> str | None:
-        """Return the robot name of a system id, None when such a vehicle is not accepted."""
-        named = self.names.get(str(system))
-        if named is not None:
-            return named
-        return f"{self.prefix}{system}" if self.prefix else None
-
-    def check(self) -> None:
-        """Raise ConfigError for an address, system id or name that cannot be."""
-        _ = self.remote
-        if self.mavlink1 and self.signing:
-            raise ConfigError(
-                f"robots.mavlink {self.remote}: MAVLink 1 has no signatures", remedy="leave out mavlink1 or signing"
-            )
-        for system, name in self.names.items():
-            if not system.isdecimal() or not 1 <= int(system) <= MAX_SYSTEM:
-                raise ConfigError(
-                    f"robots.mavlink names: {system!r} is not a MAVLink system id", remedy="use 1 to 255 as keys"
-                )
-            _check_robot_name(name)
-        if self.prefix:
-            _check_robot_name(f"{self.prefix}{MAX_SYSTEM}")
 
 
 class Template(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -138,6 +55,10 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     route: bool = True
     """Pass frames on between links and ends, as MAVLink routers do: a ground station on one link then sees and
     commands the vehicles of the others. Off: the gateway alone speaks to its vehicles."""
+    vehicles_share: tuple[str, ...] = ("ADSB_VEHICLE", "COLLISION", "SYSTEM_TIME")
+    """Messages for everybody that vehicles get of each other, by name: traffic, collision warnings, the time.
+    FOLLOW_TARGET or GLOBAL_POSITION_INT let one vehicle follow another. Other telemetry goes to ground stations and
+    onboard computers only: with N vehicles it would be N times N frames."""
     sender_hz: float = 5000.0
     """Most frames a second from one other end of a link, with a burst of as many: a vehicle sends 50 to 500, a router
     with ten vehicles behind it ten times that. What more comes in datagrams is dropped and counted as `flood`, a
@@ -215,31 +136,3 @@ class RobotsConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             raise ConfigError(f"robots.mission_items {self.mission_items}", remedy=f"use 1 to {MAX_MISSION}")
         if not 1 <= self.system_id <= MAX_SYSTEM:
             raise ConfigError(f"robots.system_id {self.system_id} is not a MAVLink system id", remedy="use 1 to 255")
-
-
-def read_remote(url: str, *, listens: bool) -> Remote:
-    """Split `udp://host:port`, `tcp://host:port` or `serial:/dev/name:baud`; ConfigError with the remedy otherwise."""
-    problem = ConfigError(
-        f"MAVLink address {url[:200]!r} is not understood",
-        remedy="write udp://host:port or tcp://host:port, or serial:/dev/name:baud",
-    )
-    if url.startswith("serial:"):
-        device, _, baud = url.removeprefix("serial:").rpartition(":")
-        if not device.startswith("/") or not baud.isascii() or not baud.isdecimal():
-            raise problem
-        return Remote("serial", device, int(baud), False)
-    try:
-        parts = urlsplit(url)
-        port = parts.port
-    except ValueError:
-        raise problem from None
-    if parts.scheme not in ("udp", "tcp") or not parts.hostname or port is None or parts.path not in ("", "/"):
-        raise problem
-    return Remote("udp" if parts.scheme == "udp" else "tcp", parts.hostname, port, listens)
-
-
-def _check_robot_name(name: str) -> None:
-    try:
-        check_name(name, "robot")
-    except PayloadError as error:
-        raise ConfigError(f"robots.mavlink: {error.message}", remedy=error.remedy) from error

@@ -5,7 +5,7 @@ is `Tasks`, which the composition root puts in. A put is heard by every gateway 
 request without an id gets one made of the robot, the text and the publisher's second, so that several gateways that
 submit it submit one task. A query goes to one gateway, and its answer is the task's record once that is durable, or the
 reason why not. The task is of the robot on whose key it came, whomever it names: what robots may have done
-(`safety.robot_tasks`), whose turn it is and who is told to have asked hang on that.
+(`safety.robot_tasks`), whose turn it is and who counts as the asker hang on that.
 """
 
 import hashlib
@@ -17,15 +17,15 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import PayloadError
-from appliance.model import Plan, TaskRecord, TaskRequest, encode
-from appliance.plane.keys import check_name
+from appliance.model import Plan, TaskRecord, TaskRequest, encode, keyspace
+from appliance.model.keys import check_name
 from appliance.plane.session import Closer, Message, Session
 
 
 class Tasks(Struct, frozen=True):
     """The doors to the fleet's tasks: `submit` returns when the task is durable, `cancel` when it is being stopped.
 
-    `cancel` is told by whom: a vehicle's name, or `mavlink-{system}-{component}` of whoever else spoke. `look`
+    `cancel` gets by whom: a vehicle's name, or `mavlink-{system}-{component}` of another speaker. `look`
     returns how a task stands; `submit_of` submits what a robot asked on its own key. All raise SwiftbotErrors.
     """
 
@@ -71,7 +71,7 @@ class TaskListener:
 
     def start(self) -> None:
         """Begin to listen."""
-        key = self._session.keys.intake()
+        key = self._session.keys(keyspace.INTAKE)
         self._closers.append(self._session.subscribe(key, self._heard))
         if self._submit is not None:
             self._closers.append(self._session.serve(key, self._asked))
@@ -83,7 +83,7 @@ class TaskListener:
         self._closers.clear()
 
     async def _asked(self, key: str, payload: bytes) -> bytes:
-        """Answer a query; errors are told to whoever asks."""
+        """Answer a query; errors go to the asker."""
         assert self._submit is not None  # noqa: S101 - only served with one
         try:
             robot, request = read_request(Message(key, payload, False, time.time_ns(), ""))
@@ -106,7 +106,7 @@ class TaskListener:
 
 def read_request(message: Message) -> tuple[str, TaskRequest]:
     """Return the robot and its checked request, with an id, and as its own; PayloadError when it is none (pure)."""
-    robot = check_name(message.key.split("/")[-2], "robot")
+    robot = check_name(keyspace.INTAKE.names(message.key)[0], "robot")
     if len(message.payload) > MAX_BYTES:
         raise PayloadError(f"a task request of {len(message.payload)} bytes", remedy=f"at most {MAX_BYTES}")
     try:
@@ -127,7 +127,7 @@ def read_request(message: Message) -> tuple[str, TaskRequest]:
 def own(request: TaskRequest, *, identity: str, submitter: str) -> TaskRequest:
     """Return what a robot asks as its own, whomever it names.
 
-    Where its plan came from is not for it to say: that is told by whoever makes plans here, and would bring it into the
+    Where its plan came from is not for it to say: planners here say that, and would bring it into the
     cache of those.
     """
     plan = request.plan

@@ -6,7 +6,7 @@ silently ignored is an accident. Pure.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import msgspec
@@ -28,6 +28,22 @@ class RobotFailure(Exception):  # noqa: N818 - not an error of the appliance: wh
         self.failure = Failure(code=code, message=message, remedy=remedy, retryable=retryable)
 
 
+A = TypeVar("A", bound=Struct)
+
+_ARGS: dict[str, type[Struct]] = {}
+"""Verb -> the struct of its arguments."""
+
+
+def arguments_of(*verbs: str) -> Callable[[type[A]], type[A]]:
+    """Make a struct the arguments of these verbs."""
+
+    def register(kind: type[A]) -> type[A]:
+        _ARGS.update(dict.fromkeys(verbs, kind))
+        return kind
+
+    return register
+
+
 class Waypoint(Struct, frozen=True, forbid_unknown_fields=True):
     """A point of a way in site metres; a `z` of None or near the ground: a flying robot keeps its altitude."""
 
@@ -36,10 +52,12 @@ class Waypoint(Struct, frozen=True, forbid_unknown_fields=True):
     z: float | None = None
 
 
+@arguments_of("state", "land", "return_home", "arm", "disarm", "release")
 class NoArgs(Struct, frozen=True, forbid_unknown_fields=True):
-    """`state`, `land`, `return_home`, `arm`, `disarm`, `release`."""
+    """Verbs that say all by their name."""
 
 
+@arguments_of("goto")
 class GotoArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`goto`: waypoints in order; the last is where it ends."""
 
@@ -47,19 +65,22 @@ class GotoArgs(Struct, frozen=True, forbid_unknown_fields=True):
     speed_mps: float | None = None
 
 
+@arguments_of("takeoff")
 class TakeoffArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`takeoff`: metres above home."""
 
     altitude_m: float | None = None
 
 
+@arguments_of("hold")
 class HoldArgs(Struct, frozen=True, forbid_unknown_fields=True):
-    """`hold`: stop where it is; ends at once, or after `duration_s` of staying. `why` is told to what it ends."""
+    """`hold`: stop where it is; ends at once, or after `duration_s` of staying. The commands that it ends get `why`."""
 
     duration_s: float | None = None
     why: str = ""
 
 
+@arguments_of("stop")
 class StopArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`stop`: end the command of that id (none given: all) with failure `cancelled`, and hold position."""
 
@@ -77,6 +98,7 @@ class MissionStep(Struct, frozen=True, forbid_unknown_fields=True):
     act: Literal["", "photo", "grab", "release"] = ""
 
 
+@arguments_of("mission")
 class MissionArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`mission`: steps in order, then `end`. `resume`: go on with the same mission where it was left."""
 
@@ -86,6 +108,7 @@ class MissionArgs(Struct, frozen=True, forbid_unknown_fields=True):
     resume: bool = True
 
 
+@arguments_of("orbit")
 class OrbitArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`orbit`: circle round a point; a negative radius goes counter-clockwise."""
 
@@ -97,12 +120,14 @@ class OrbitArgs(Struct, frozen=True, forbid_unknown_fields=True):
     speed_mps: float | None = None
 
 
+@arguments_of("set_mode")
 class ModeArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`set_mode`: the autopilot's mode by name."""
 
     mode: str
 
 
+@arguments_of("parameter")
 class ParameterArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`parameter`: read one of the autopilot's parameters, or write it where a value is given."""
 
@@ -110,6 +135,7 @@ class ParameterArgs(Struct, frozen=True, forbid_unknown_fields=True):
     value: float | None = None
 
 
+@arguments_of("trigger")
 class TriggerArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`trigger`: take pictures with the camera on board, which keeps them."""
 
@@ -117,12 +143,14 @@ class TriggerArgs(Struct, frozen=True, forbid_unknown_fields=True):
     interval_s: float = 1.0
 
 
+@arguments_of("video")
 class VideoArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`video`: start or stop the camera's recording on board."""
 
     action: Literal["start", "stop"]
 
 
+@arguments_of("gripper")
 class GripperArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`gripper`: grab or release; instances count from 1."""
 
@@ -130,6 +158,7 @@ class GripperArgs(Struct, frozen=True, forbid_unknown_fields=True):
     instance: int = 1
 
 
+@arguments_of("gimbal")
 class GimbalArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`gimbal`: to angles in degrees (pitch up, yaw clockwise from the nose), or at a point of the site."""
 
@@ -140,6 +169,7 @@ class GimbalArgs(Struct, frozen=True, forbid_unknown_fields=True):
     z: float = 0.0
 
 
+@arguments_of("servo")
 class ServoArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`servo`: an output of the autopilot (1 to 16) to a pulse width in microseconds."""
 
@@ -147,6 +177,7 @@ class ServoArgs(Struct, frozen=True, forbid_unknown_fields=True):
     pwm_us: int
 
 
+@arguments_of("say")
 class SayArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`say`: words for people about, or a tune (MML, as PLAY_TUNE takes it), or both."""
 
@@ -154,19 +185,22 @@ class SayArgs(Struct, frozen=True, forbid_unknown_fields=True):
     tune: str = ""
 
 
+@arguments_of("ask")
 class AskArgs(Struct, frozen=True, forbid_unknown_fields=True):
-    """`ask`: a question to somebody near by; `to` is their name, empty for whoever is nearest."""
+    """`ask`: a question to somebody near by; `to` is their name, empty for the person nearest."""
 
     question: str
     to: str = ""
 
 
+@arguments_of("open", "close", "switch_on", "switch_off")
 class NamedArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`open`, `close`, `switch_on`, `switch_off`: what is meant, by name."""
 
     object: str
 
 
+@arguments_of("give")
 class GiveArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`give`: the held object to a person, or another robot, within reach."""
 
@@ -174,10 +208,11 @@ class GiveArgs(Struct, frozen=True, forbid_unknown_fields=True):
     to: str
 
 
+@arguments_of("velocity")
 class VelocityArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`velocity`: move by hand for a moment, as seen from the robot; repeated, each takes the place of the last.
 
-    After `for_s` it holds by itself: whoever moves it must go on saying so. `turn_dps` is to the right.
+    After `for_s` it holds by itself: its pilot must go on saying so. `turn_dps` is to the right.
     """
 
     forward_mps: float = 0.0
@@ -187,12 +222,14 @@ class VelocityArgs(Struct, frozen=True, forbid_unknown_fields=True):
     for_s: float = 0.5
 
 
+@arguments_of("pick")
 class PickArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`pick`: the object by name."""
 
     object: str
 
 
+@arguments_of("place")
 class PlaceArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`place`: the held object, at a place within reach."""
 
@@ -200,6 +237,7 @@ class PlaceArgs(Struct, frozen=True, forbid_unknown_fields=True):
     at: str
 
 
+@arguments_of("capture")
 class CaptureArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`capture`: one picture towards the target."""
 
@@ -208,49 +246,13 @@ class CaptureArgs(Struct, frozen=True, forbid_unknown_fields=True):
     height: int | None = None
 
 
+@arguments_of("record")
 class RecordArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """`record`: pictures at `fps` for `duration_s`."""
 
     target: str
     duration_s: float | None = None
     fps: float | None = None
-
-
-_ARGS: dict[str, type[Struct]] = {
-    "state": NoArgs,
-    "goto": GotoArgs,
-    "takeoff": TakeoffArgs,
-    "land": NoArgs,
-    "hold": HoldArgs,
-    "velocity": VelocityArgs,
-    "return_home": NoArgs,
-    "arm": NoArgs,
-    "disarm": NoArgs,
-    "pick": PickArgs,
-    "place": PlaceArgs,
-    "capture": CaptureArgs,
-    "record": RecordArgs,
-    "stop": StopArgs,
-    "mission": MissionArgs,
-    "orbit": OrbitArgs,
-    "set_mode": ModeArgs,
-    "parameter": ParameterArgs,
-    "release": NoArgs,
-    "trigger": TriggerArgs,
-    "video": VideoArgs,
-    "gripper": GripperArgs,
-    "gimbal": GimbalArgs,
-    "servo": ServoArgs,
-    "say": SayArgs,
-    "ask": AskArgs,
-    "open": NamedArgs,
-    "close": NamedArgs,
-    "switch_on": NamedArgs,
-    "switch_off": NamedArgs,
-    "give": GiveArgs,
-}
-
-A = TypeVar("A", bound=Struct)
 
 
 def parse_args(verb: str, args: Mapping[str, Any], kind: type[A]) -> A:

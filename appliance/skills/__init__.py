@@ -1,5 +1,8 @@
 """Built-in skills: one folder a skill with manifest and handler, and the images they run in.
 
-Doors: `catalogue.load_catalogue` (skills and images), `catalogue.image_reference` (an image's name with its hash),
-`sites.load_site` (what place names mean). The handlers and `_lib` run in containers and are imported by nothing here.
+Doors: `catalogue` (skills and images, their manifests), `requirements` (Python packages of an image), `sites` (what
+place names mean), `_lib.coordinates` (coordinates in words, read alike by plans and handlers), `_lib.learning` (data
+sets and what learns from them, alike here and in handlers).
+
+The handlers and the rest of `_lib` run in containers and are imported by nothing here.
 """

@@ -41,8 +41,8 @@ DOMAINS = (
 )
 """What instructions are about; a plan names one of them."""
 
-NOT_SKILLS = frozenset({"_lib", "images", "sites", "__pycache__"})
-"""Folders beside the skills that hold something else: shared code of handlers, images, sites."""
+NOT_SKILLS = frozenset({"_lib", "images", "models", "sites", "__pycache__"})
+"""Folders beside the skills that hold something else: shared code of handlers, images, models, sites."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
 WHEELHOUSE = "wheelhouse"
@@ -62,6 +62,13 @@ class Param(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     description: str = ""
     usual: float | Annotated[str, Meta(min_length=1, max_length=60)] | None = None
     """What its handler takes where a plan says nothing; None: nothing fixed. The safety policy looks at it."""
+    least: float | None = None
+    most: float | None = None
+    """Bounds of a number; a plan beyond them is refused."""
+    names: Literal["", "place"] = ""
+    """What a text names: a place of the site."""
+    verbatim: bool = False
+    """A text that people read or hear: it keeps the capitals of the instruction."""
 
 
 class Output(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -124,7 +131,12 @@ class SkillManifest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     preload_mb: Annotated[int, Meta(ge=0, le=65536)] = 0
     """Memory its `preload` may take; 0: it has none. A container of its image is given so much more."""
     preload_s: Annotated[float, Meta(gt=0, le=600)] = 10.0
-    """Longest `preload`; all that a container loads has at most 40 % of `pool.start_timeout_s` besides."""
+    """Longest `preload`; all that a container loads is bounded too, by 40 % of `pool.start_timeout_s` or by `load_s` of
+    its image, whichever is longer."""
+    folders: tuple[Word, ...] = ()
+    """Folders of the gateway's machine that it reads, mounted read-only: `pool.folders` says where each is."""
+    cache: bool = False
+    """Whether it keeps what it can work out again in a folder of the gateway that containers of its image share."""
     file_mb: Annotated[int, Meta(ge=1, le=1 << 20)] = 256
     """Longest file its runs may write, in a volume too; what they write there together ends where the disk is short."""
     timeout_s: Annotated[float, Meta(gt=0, le=86400)] = 120.0
@@ -202,6 +214,11 @@ class ImageSpec(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Modules every zygote of this image imports beforehand."""
     compatible: tuple[str, ...] = ()
     """Images whose skills it can also run."""
+    load_s: Annotated[float, Meta(ge=0, le=600)] = 0.0
+    """Longest that a container may take to load all it preloads, for an image with large modules. The time for a start
+    follows from it. 0: 40 % of `pool.start_timeout_s`."""
+    on_demand: bool = False
+    """Whether it is built only when it is named, or when something needs it: it takes minutes."""
     folder: Path = Path()
     """Where it was read from. Set by the loader, never in the file."""
 
@@ -212,6 +229,13 @@ class Catalogue(Struct, frozen=True):
     domains: tuple[str, ...]
     skills: dict[str, SkillManifest]
     images: dict[str, ImageSpec]
+
+    @property
+    def verbatim(self) -> frozenset[tuple[str, str]]:
+        """Skill and parameter of the texts that people read or hear."""
+        return frozenset(
+            (skill.id, name) for skill in self.skills.values() for name, each in skill.params.items() if each.verbatim
+        )
 
 
 def load_catalogue(extra: Sequence[Path] = ()) -> Catalogue:

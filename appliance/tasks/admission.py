@@ -10,18 +10,11 @@ from collections.abc import Collection, Generator, Mapping
 from msgspec.structs import replace
 
 from appliance.errors import PayloadError, RefusedError
-from appliance.llm.preprocessing import stop_refused
+from appliance.llm.preprocessing import stop_refused, training_refused
 from appliance.llm.stop_words import stop_request
-from appliance.model import (
-    HIGHEST_PRIORITY,
-    LONGEST_DEADLINE_S,
-    PLAIN_PRIORITY,
-    SPLIT,
-    Plan,
-    TaskRequest,
-    oversize,
-)
-from appliance.plane.keys import check_name
+from appliance.llm.training_words import training_request
+from appliance.model import HIGHEST_PRIORITY, LONGEST_DEADLINE_S, PLAIN_PRIORITY, SPLIT, Plan, TaskRequest, oversize
+from appliance.model.keys import check_name
 from appliance.tasks.records import MAX_DEPTH, too_deep
 from appliance.tasks.settings import TasksConfig
 
@@ -66,14 +59,20 @@ def checked(request: TaskRequest, config: TasksConfig) -> TaskRequest:
     return replace(request, instruction=instruction, id=check_name(task, "task"))
 
 
-def refuse_stop(request: TaskRequest, robots: Collection[str]) -> None:
-    """Refuse an instruction that is a soft stop: an operator's tool carries it out, and nobody else may order it.
+def refuse_commands(request: TaskRequest, robots: Collection[str]) -> None:
+    """Refuse an instruction that is no task but another command: a soft stop, or a run of federated learning.
+
+    An operator's tool carries them out, and nobody else may order them.
 
     Raises:
         RefusedError: it is one, with the command.
     """
-    if request.plan is None and (stop := stop_request(request.instruction, tuple(robots))) is not None:
+    if request.plan is not None:
+        return
+    if (stop := stop_request(request.instruction, tuple(robots))) is not None:
         raise stop_refused(stop)
+    if (training := training_request(request.instruction, tuple(robots))) is not None:
+        raise training_refused(training)
 
 
 class Ends:

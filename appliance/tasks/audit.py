@@ -10,10 +10,10 @@ import structlog
 from msgspec import Struct
 
 from appliance.errors import SwiftbotError
-from appliance.model import Act, Signed, TaskRecord, TaskRequest, encode
-from appliance.plane.keys import Keys
+from appliance.model import Act, Signed, TaskRecord, TaskRequest, keyspace
+from appliance.model.keys import Keys
+from appliance.model.task_api import ActList, ActsAsk
 from appliance.plane.session import Closer, Session
-from appliance.tasks.api import ActList, ActsAsk
 from appliance.tasks.records import clean
 
 log = structlog.get_logger(__name__)
@@ -23,6 +23,10 @@ SUBMIT = "submit"
 KEPT = 500
 """Orders that a gateway remembers for those who ask, its own and others'; the log on disk has all."""
 MAX_PROBLEM = 1000
+OF_GATEWAY = frozenset(
+    {"drain", "undrain", "pool_warm", "pool_evict", "pool_release_quarantine", "llm_swap", "image_fetch"}
+)
+"""Verbs that change something of the gateway itself."""
 _TARGETS = ("id", "task", "robot", "robots", "container", "image", "folder", "reference")
 
 Q = TypeVar("Q", bound=Signed)
@@ -43,7 +47,7 @@ class Audit:
 
     def listen(self) -> Closer:
         """Remember what was ordered of others too: a gateway that dies takes no order along."""
-        return self._session.subscribe_typed(self._keys.act(), Act, self._on_act)
+        return self._session.subscribe_typed(keyspace.ACT, self._on_act)
 
     def _on_act(self, key: str, act: Act | None) -> None:
         if act is not None and act.gateway != self._gateway and key.endswith(f"/{act.gateway}"):
@@ -99,7 +103,7 @@ class Audit:
             id=ask.act or f"o-{uuid.uuid4().hex[:16]}",
             verb=verb,
             by=clean(ask.by, 120) or "unsigned",
-            target=clean(target, 300) or target_of(ask),
+            target=clean(target, 300) or self._target(verb, ask),
             why=clean(ask.why, 500),
             outcome=outcome,
             problem=clean(problem, MAX_PROBLEM),
@@ -108,7 +112,7 @@ class Audit:
             took_ms=round((time.monotonic() - began) * 1e3, 2),
         )
         self._keep(act)
-        self._session.put(self._keys.act(self._gateway), encode(act))
+        self._session.publish(keyspace.ACT, act, self._gateway)
         log.info(
             "operator's order",
             verb=verb,
@@ -119,6 +123,13 @@ class Audit:
             problem=act.problem,
             act=act.id,
         )
+
+    def _target(self, verb: str, ask: Signed) -> str:
+        """Return what an order is about; one to a gateway for itself names that gateway."""
+        target = target_of(ask)
+        if verb not in OF_GATEWAY:
+            return target
+        return f"{target} on {self._gateway}" if target else self._gateway
 
     async def acts(self, ask: ActsAsk) -> ActList:
         """Answer `acts`."""

@@ -18,7 +18,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, SwiftbotError
-from appliance.model import RunEvent, RunEventKind, VersionVector, encode
+from appliance.model import RunEvent, RunEventKind, VersionVector, encode, keyspace
 from appliance.plane.dht import Dht
 from appliance.pool.selection import size_text
 from appliance.tasks.records import result_problem
@@ -29,7 +29,6 @@ EVERY_S = 1.0
 """Least time between two writes of one run; each is a replicated write."""
 LAST_S = 2.0
 """How long the end of a run waits for its last checkpoint to be written."""
-PREFIX = "checkpoint/"
 
 
 class Checkpoint(Struct, frozen=True, kw_only=True):
@@ -45,7 +44,7 @@ class Checkpoint(Struct, frozen=True, kw_only=True):
 
 def checkpoint_key(task: str, subtask: str) -> str:
     """Key of a subtask's checkpoint in the DHT."""
-    return f"{PREFIX}{task}/{subtask}"
+    return keyspace.CHECKPOINT_RECORD.key(task, subtask)
 
 
 def stronger(one: bytes, other: bytes) -> bytes:

@@ -9,19 +9,21 @@ known of those that lost (`TaskRecord.splits`); that too comes out the same in w
 
 **Healing**: the coordinator of the version that stands settles each of those that lost once. The highest attempt that
 either side made becomes the fence below the next one, runs of the other side are ended where they are, what they still
-tell is refused, and people get a notice. So does whoever gave an order that only a version that lost has carried out:
-it was answered as done, and is not. A run of the version that stands goes on unless the other side has sent a higher
-attempt of it to a robot: the robot would refuse it, so it is repeated.
+tell is refused, and people get a notice. So does the operator of an order that only a version that lost has carried
+out: it was answered as done, and is not. A run of the version that stands goes on unless the other side has sent a
+higher attempt of it to a robot: the robot would refuse it, so it is repeated.
 """
 
 import asyncio
 import time
+from collections.abc import Callable, Iterable
 
 import msgspec
 import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
+from appliance.alerts import rules
 from appliance.errors import PayloadError, SwiftbotError
 from appliance.model import (
     Failure,
@@ -35,16 +37,17 @@ from appliance.model import (
     TaskRecord,
     TaskState,
     encode,
+    keyspace,
 )
+from appliance.model.keys import RecordKind, check_name
+from appliance.model.task_api import RunAsk
+from appliance.model.transitions import TransitionKind
 from appliance.plane.dht import Record
-from appliance.plane.keys import check_name
 from appliance.plane.node import Plane
-from appliance.pool import lineage
+from appliance.pool.volumes import lineage
 from appliance.tasks import checkpoints, enquiries
-from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.record_writer import Keeper
-from appliance.tasks.records import MAX_NOTE, clean, unsettled
-from appliance.tasks.transition import TransitionKind
+from appliance.tasks.record_writer import RecordWriter, SupersededError
+from appliance.tasks.records import MAX_NOTE, clean, read_record, task_key, unsettled
 
 MOST_SPLITS = 8
 """Versions that lost and are remembered in the one that stands: a fleet falls into few parts."""
@@ -146,19 +149,25 @@ def _rank(value: bytes) -> _Rank:
     return (int(record.state.final), finished, told, -load, free, coordinator, record.sequence, _core(value), value)
 
 
+_STRONGER: dict[RecordKind, Callable[[bytes, bytes], bytes]] = {
+    keyspace.CHECKPOINT_RECORD: checkpoints.stronger,
+    keyspace.VOLUME_RECORD: lineage.stronger,
+    keyspace.ENQUIRY_RECORD: enquiries.stronger,
+    keyspace.ALERT_RECORD: rules.stronger,
+}
+"""Which of two concurrent values of a kind stands."""
+
+
 def resolver(key: str, one: Record, other: Record) -> Record:
     """Choose between concurrent versions of any record: those of known rooms by what they say, others by bytes."""
-    if key.startswith("task/") and one.deleted == other.deleted:
+    kind = keyspace.record_kind(key) if one.deleted == other.deleted else None
+    if kind is keyspace.TASK_RECORD:
         winner = one if stronger(one.value, other.value) == one.value else other
         value = merged(one.value, other.value)
         # No longer what anybody wrote: a writer of one of them must not take it for its own.
         return winner if value == winner.value else msgspec.structs.replace(winner, value=value, write="")
-    if key.startswith(checkpoints.PREFIX) and one.deleted == other.deleted:
-        return one if checkpoints.stronger(one.value, other.value) == one.value else other
-    if key.startswith(lineage.KEY) and one.deleted == other.deleted:
-        return one if lineage.stronger(one.value, other.value) == one.value else other
-    if key.startswith(enquiries.PREFIX) and one.deleted == other.deleted:
-        return one if enquiries.stronger(one.value, other.value) == one.value else other
+    if kind is not None and (of_kind := _STRONGER.get(kind)) is not None:
+        return one if of_kind(one.value, other.value) == one.value else other
     return max(one, other, key=lambda record: (record.deleted, record.value))
 
 
@@ -197,19 +206,24 @@ class Healing(Struct, frozen=True, kw_only=True):
     superseded: tuple[str, ...]
     """Subtasks of the version that stands whose run is to be repeated under a higher number."""
     notes: tuple[str, ...]
-    """What people are told; none where nothing was doubled and no order lost."""
+    """Notices for people; none where nothing was doubled and no order lost."""
     noted: tuple[str, ...]
-    """Which version or order each note is about: whoever settles it, it is the same notice."""
+    """Which version or order each note is about: the same notice, whichever gateway settles it."""
     to: tuple[str, ...]
-    """Who each note is for: whoever gave the order that lost, else any operator."""
+    """Who each note is for: the operator of the order that lost, else any."""
 
-    async def settle(self, plane: Plane, keeper: Keeper) -> None:
+    async def settle(self, plane: Plane, writer: RecordWriter) -> None:
         """Tell people, write it into the record, then end what is doubled.
 
-        Told first: when two gateways settle at once, the mark that it is settled may stand though the write of whoever
-        made it is refused, or its driver is ended meanwhile. Told twice it is the same notice, by its id.
+        The notice comes first: when two gateways settle at once, the mark that it is settled may stand though the write
+        of the gateway that made it is refused, or its coordinator ends meanwhile. Given twice it is the same notice, by
+        its id. For the same
+        reason a refused write ends doubled runs too: those that the record, read again, does not have.
+
+        Raises:
+            SupersededError: another gateway has written meanwhile.
         """
-        task = keeper.record.id
+        task = writer.draft.record.id
         for name, note, to in zip(self.noted, self.notes, self.to, strict=True):
             notice = Notice(
                 id=f"{task}/healed/{name}",
@@ -219,17 +233,33 @@ class Healing(Struct, frozen=True, kw_only=True):
                 gateway=plane.gateway,
                 at_ns=time.time_ns(),
             )
-            plane.session.put(plane.keys.notice(to), encode(notice))
+            plane.session.publish(keyspace.NOTICE, notice, to)
             log.warning("a partition has healed", task=task, note=note)
-        keeper.apply(keeper.transition(TransitionKind.HEALED, splits=self.splits, fences=self.fences))
-        await keeper.flush()
-        await asyncio.gather(*(_end(plane, task, run) for run in self.ends))
+        writer.draft.apply(TransitionKind.HEALED, splits=self.splits, fences=self.fences)
+        try:
+            await writer.flush()
+        except SupersededError:
+            stored = await plane.dht.read(task_key(task))
+            standing = read_record(stored.value).subtasks if stored is not None and not stored.deleted else ()
+            held = {each.subtask.id: each for each in standing}
+            await _end_all(plane, task, [run for run in self.ends if not _held(held.get(run.subtask), run)])
+            raise
+        await _end_all(plane, task, self.ends)
+
+
+async def _end_all(plane: Plane, task: str, runs: Iterable[LostRun]) -> None:
+    await asyncio.gather(*(_end(plane, task, run) for run in runs))
+
+
+def _held(own: SubtaskRecord | None, run: LostRun) -> bool:
+    """Whether a record has this very run."""
+    return own is not None and (own.attempt, own.gateway) == (run.attempt, run.gateway)
 
 
 async def _end(plane: Plane, task: str, run: LostRun) -> None:
     ask = RunAsk(task=task, subtask=run.subtask, attempt=run.attempt)
     try:
-        await plane.rpc.call(run.gateway, "run_cancel", ask, RunStatus, timeout_s=END_S)
+        await plane.rpc.call(run.gateway, keyspace.RUN_CANCEL, ask, timeout_s=END_S)
     except SwiftbotError as error:
         log.info("a doubled run could not be ended", run=ask.run_id, gateway=run.gateway, reason=str(error))
 

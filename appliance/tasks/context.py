@@ -1,69 +1,25 @@
-"""What a coordinator needs of its gateway, and what it is told: the seam between driving a task and the world."""
+"""What coordinators decide with: the parts of their gateway, and who may command robots."""
 
-import asyncio
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+import structlog
 from msgspec import Struct
 
-from appliance.errors import RefusedError, SwiftbotError
-from appliance.model import (
-    Group,
-    Need,
-    Plan,
-    RunAccepted,
-    RunEvent,
-    RunRequest,
-    SoftStop,
-    SubtaskRecord,
-    TaskRecord,
-    Word,
-)
+from appliance.errors import NotFoundError
+from appliance.model import Plan, SoftStop, SubtaskRecord, TaskRecord
+from appliance.model.transitions import Transition
 from appliance.plane.node import Plane
-from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
-from appliance.tasks.checkpoints import Checkpoint
-from appliance.tasks.placement import Place, Placement
-from appliance.tasks.records import MAX_RUN_S
-from appliance.tasks.replan import Robots
+from appliance.skills.catalogue import Catalogue, SkillManifest
+from appliance.tasks.admission import expectation, longest_s
+from appliance.tasks.lookahead import LookAhead
+from appliance.tasks.plans import Plans
+from appliance.tasks.records import clean
+from appliance.tasks.scheduler import Scheduler
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.transition import Transition
 
-PREFIX = "task/"
-"""Of the keys of task records in the DHT."""
-
-
-class Recovering(Protocol):
-    """What finding runs that go wrong and revising plans needs; `tasks.recovery` provides it."""
-
-    @property
-    def manifests(self) -> Mapping[str, SkillManifest]:
-        """Manifests by skill, of those known here."""
-        ...
-
-    def robots(self) -> Robots:
-        """Return the roster as it is known now."""
-        ...
-
-    def experience(self, skill: str) -> Sequence[float]:
-        """Return how long the last runs of a skill took, seconds."""
-        ...
-
-    def published(self, transition: Transition) -> None:
-        """Hear of a transition that was published."""
-        ...
-
-    def note(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:
-        """Count what was found or done, and say it in the log."""
-        ...
-
-    def against(self, record: TaskRecord, target: SubtaskRecord, plan: Plan, robot: str = "") -> tuple[str, ...]:
-        """Say what a revised plan makes wrong that was not wrong before; `robot`: who takes over from `target`'s."""
-        ...
-
-    async def replan(self, record: TaskRecord) -> Plan:
-        """Have the decomposer plan anew what is left; PlanError when it cannot."""
-        ...
+log = structlog.get_logger(__name__)
 
 
 class Commands(Protocol):
@@ -109,185 +65,66 @@ FREE: Commands = _Free()
 """For a task manager without robots."""
 
 
-class Surroundings(Protocol):
-    """What a driver needs of its gateway; the coordinator provides it."""
+class Context(Struct, frozen=True, kw_only=True):
+    """The parts of one gateway, shared by its coordinators."""
 
     plane: Plane
     config: TasksConfig
-
-    @property
-    def recovery(self) -> Recovering:
-        """What finding runs that go wrong and revising plans needs."""
-        ...
-
-    @property
-    def commands(self) -> Commands:
-        """Who may command robots."""
-        ...
-
-    def approval(self, record: TaskRecord, plan: Plan) -> str:
-        """Why a plan has to be approved before it takes effect; "" when it need not be."""
-        ...
-
-    def plan_problems(self, record: TaskRecord, plan: Plan) -> tuple[str, ...]:
-        """What is wrong with an edited plan in place of the one that waits, a sentence each."""
-        ...
-
-    async def plan(self, record: TaskRecord) -> Plan:
-        """Return a valid plan, the one handed in with the task or a new one; PlanError otherwise."""
-        ...
+    catalogue: Catalogue
+    scheduler: Scheduler
+    plans: Plans
+    ahead: LookAhead
+    commands: Commands = FREE
+    on_transition: Callable[[Transition], None] = lambda _: None
+    """Gets each transition that is published here."""
+    findings: Counter[str]
+    """What the watchdog and replanning found and did, by kind, since start."""
 
     def manifest(self, skill: str) -> SkillManifest:
-        """Return a skill's manifest; NotFoundError when this gateway does not know it."""
-        ...
+        """Return a skill's manifest; NotFoundError when this gateway does not know it (another may)."""
+        if (found := self.catalogue.skills.get(skill)) is None:
+            raise NotFoundError(
+                f"{self.plane.gateway} has no skill {clean(skill, 80)!r}", remedy="give all gateways the same skills"
+            )
+        return found
 
-    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
-        """Choose the robot of a subtask, or None with the reason for the wait."""
-        ...
+    def durations(self, skill: str) -> Sequence[float]:
+        """Return how long the last runs of a skill took, seconds."""
+        return self.ahead.durations.seen(skill)
 
-    def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
-        """Order the gateways for a subtask."""
-        ...
+    def expected_s(self, skill: str, params: dict[str, Any]) -> float:
+        """Return how long a run is expected to take, seconds; 0.0 when no run of its skill was seen."""
+        durations = self.ahead.durations
+        return durations.of(skill, params) if durations.seen(skill) else 0.0
 
-    def regroup(self, record: TaskRecord) -> Group | None:
-        """Return the group that a task should have from now on, or None when the present one may stay."""
-        ...
+    def expect(self, plan: Plan | None, *, deadline_s: float, elapsed_s: float = 0.0) -> str:
+        """Say in words what a task must expect: a wait, a deadline that can hardly be met; "" when nothing."""
+        line, work_s = self.scheduler.line, None
+        if plan is not None:
+            durations = self.ahead.durations
+            seen = [subtask for subtask in plan.subtasks if durations.seen(subtask.skill)]  # no warning from a guess
+            work_s = longest_s(plan, {subtask.id: durations.of(subtask.skill, subtask.params) for subtask in seen})
+        return expectation(
+            waiting=len(line),
+            wait_s=line.expected_s(len(line) + 1),
+            work_s=work_s,
+            deadline_s=deadline_s,
+            elapsed_s=elapsed_s,
+        )
 
-    def sent(self, record: TaskRecord, target: SubtaskRecord, placement: Placement) -> None:
-        """Tell, for the log, how the gateways stood when a subtask was sent."""
-        ...
-
-    def turn(self, record: TaskRecord, target: SubtaskRecord, placement: Placement, left_s: float) -> Place:
-        """Return where a ready subtask may go now, or its place among those that wait for room."""
-        ...
-
-    def expect(self, plan: Plan, *, deadline_s: float, elapsed_s: float) -> str:
-        """Say in words what a plan must expect: a wait, a deadline that can hardly be met; "" when nothing."""
-        ...
-
-    async def order(self, gateway: str, request: RunRequest) -> RunAccepted:
-        """Send a run order, to this gateway without a detour."""
-        ...
-
-    def plan_moved(self, record: TaskRecord, running_s: Mapping[str, float]) -> None:
-        """Tell pools what the subtasks that are not ready will need; `running_s`: how long each active one has."""
-        ...
-
-    def took(self, skill: str, duration_ms: float) -> None:
+    def measured(self, skill: str, duration_ms: float) -> None:
         """Note how long a run that succeeded took."""
-        ...
+        self.ahead.durations.add(skill, duration_ms / 1e3)
+        self.scheduler.line.completions.ended(duration_ms / 1e3)
 
-    async def checkpoint(self, task: str, subtask: str) -> Checkpoint | None:
-        """Return the last checkpoint of a subtask, or None when there is none or it cannot be had."""
-        ...
-
-    async def forget_checkpoints(self, record: TaskRecord) -> None:
-        """Remove the checkpoints of a task that has ended."""
-        ...
-
-
-class RunNews(Struct, frozen=True):
-    """A run event came."""
-
-    event: RunEvent
-
-
-class GatewayLost(Struct, frozen=True):
-    """A gateway is gone."""
-
-    gateway: str
-
-
-class CancelAsked(Struct, frozen=True):
-    """Somebody wants it to stop."""
-
-    word: Word | None = None
-
-
-class Wake(Struct, frozen=True):
-    """Look again: a timer, a new robot, a new gateway."""
-
-
-class MoveReady(Struct, frozen=True, kw_only=True):
-    """A run can be left for a new attempt elsewhere: its gateway holds it, the other one is ready to take it.
-
-    `outcome` becomes the new attempt's number when the record with it is written; an error says why it was not.
-    """
-
-    subtask: str
-    attempt: int
-    next_attempt: int
-    gateway: str
-    why: str
-    placed: str
-    outcome: "asyncio.Future[int]"
-
-    def give_up(self, reason: str) -> None:
-        """Say that it cannot be any more."""
-        if not self.outcome.done():
-            self.outcome.set_exception(RefusedError(reason))
-
-    def done(self) -> None:
-        """Say that the record is written."""
-        if not self.outcome.done():
-            self.outcome.set_result(self.next_attempt)
-
-
-class PlanMade(Struct, frozen=True, kw_only=True):
-    """The decomposer has answered: the new plan, or None; `why` it was asked, and what it said."""
-
-    subtask: str
-    plan: Plan | None
-    why: str
-
-
-class Steered(Struct, frozen=True, kw_only=True):
-    """An operator's order. `outcome` becomes the record when it is written with what followed, or says why not."""
-
-    ask: ApproveAsk | RejectAsk | PauseAsk | ResumeAsk | RetryAsk
-    outcome: "asyncio.Future[TaskRecord]"
-
-    def refuse(self, error: SwiftbotError) -> None:
-        """Say why it was not taken."""
-        if not self.outcome.done():
-            self.outcome.set_exception(error)
-
-    def done(self, record: TaskRecord) -> None:
-        """Say that it is written."""
-        if not self.outcome.done():
-            self.outcome.set_result(record)
-
-
-class RunHeld(Struct, frozen=True, kw_only=True):
-    """A run has saved a checkpoint and sends no command: it can be ended for a pause (`note`: why)."""
-
-    subtask: str
-    attempt: int
-    note: str
-
-
-Input = RunNews | GatewayLost | CancelAsked | MoveReady | PlanMade | Steered | RunHeld | Wake
-
-
-def figures(plane: Plane, gateway: str) -> dict[str, Any]:
-    """What is known of a gateway that is chosen, for the attempt's record: its load and its ready containers."""
-    status = plane.registry.gateways.get(gateway)
-    return {"load": round(status.load, 3), "free": status.ready} if status is not None else {}
-
-
-def task_key(task: str) -> str:
-    """Key of a task's record in the DHT."""
-    return f"{PREFIX}{task}"
-
-
-def need_of(manifest: SkillManifest) -> Need:
-    """What a skill asks of a container."""
-    return Need(image=manifest.image, cpu=manifest.cpu, memory_mb=manifest.memory_mb, volumes=manifest.volumes)
-
-
-def deadline_s(manifest: SkillManifest, params: dict[str, Any]) -> float:
-    """Time a run may take: the skill's own, beyond the duration that was asked for (within bounds)."""
-    asked = params.get("duration_s", 0.0)
-    # Compared before it becomes a float: an integer of a plan may be too large for one.
-    extra = min(MAX_RUN_S, max(0.0, asked)) if isinstance(asked, int | float) and asked == asked else 0.0  # noqa: PLR0124 - not a number
-    return manifest.timeout_s + float(extra)
+    def notify(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:
+        """Count what the watchdog or replanning found or did, and log it."""
+        self.findings[what] += 1
+        log.info(
+            f"monitor: {what}",
+            task=record.id,
+            subtask=target.subtask.id,
+            attempt=target.attempt,
+            skill=target.subtask.skill,
+            why=why,
+        )

@@ -28,6 +28,7 @@ from msgspec import Struct
 from appliance.errors import SwiftbotError
 from appliance.model import encode
 from appliance.skills.catalogue import SkillManifest
+from appliance.tasks.settings import DetectionConfig
 
 log = structlog.get_logger(__name__)
 
@@ -110,26 +111,6 @@ class Durations:
         if self._writer is not None:
             self._writer.cancel()
         await self.write()
-
-
-class DetectionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """When a run is taken for stuck or straggling."""
-
-    stuck_factor: float = 6.0
-    """A silent run of a skill that promises no signs of life is stuck after so many times what runs of it take (at the
-    quantile): ending one that only has more to do than usual costs more than waiting."""
-    stuck_minimum_s: float = 60.0
-    """Never before, unless the manifest promises signs of life more often."""
-    straggler_factor: float = 2.0
-    """A run straggles after so many times what others take (Spark's `speculation.multiplier` is 1.5, later 3)."""
-    straggler_minimum_s: float = 5.0
-    """Never before: below it moving on costs about as much as it saves."""
-    quantile: float = 0.9
-    """Which of the known durations counts: not the median, or a tenth of all runs in a spread of two would straggle."""
-    samples: int = 5
-    """Runs of a skill that must be known before its durations are believed."""
-    siblings: int = 3
-    """Finished siblings of the same skill in the same task that do as well; their largest duration counts."""
 
 
 class Condition(StrEnum):

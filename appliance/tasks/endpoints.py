@@ -5,7 +5,7 @@
 - `explain`: why a task waits, as its coordinator knows it just now: who could serve it, who could not, and when it may
   start. What has been decided stands in the record (`why`); this adds what is in no record because it changes by the
   second.
-- `OperatorVerbs`: takes operators' orders to whoever coordinates the task, and begins tasks again that have ended.
+- `OperatorVerbs`: takes operators' orders to the task's coordinator, and begins tasks again that have ended.
 """
 
 import asyncio
@@ -17,13 +17,12 @@ from typing import TypeVar
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, DeadlineError, NotFoundError, PayloadError, SwiftbotError, UnreachableError
-from appliance.model import SubtaskRecord, SubtaskState, TaskRecord, TaskState, VersionVector, Word
-from appliance.plane.keys import check_name
-from appliance.plane.node import Plane
-from appliance.tasks.api import (
-    ActsAsk,
+from appliance.model import SubtaskRecord, SubtaskState, TaskRecord, TaskState, VersionVector, Word, keyspace
+from appliance.model.keys import Verb, check_name
+from appliance.model.task_api import (
     ApproveAsk,
     CancelTaskAsk,
+    CandidateWhy,
     PauseAsk,
     RejectAsk,
     ResumeAsk,
@@ -33,23 +32,29 @@ from appliance.tasks.api import (
     TaskAsk,
     TaskList,
     TasksAsk,
+    TaskWhy,
+    Waits,
     WhyAsk,
 )
+from appliance.plane.node import Plane
+from appliance.tasks import history
 from appliance.tasks.audit import Audit
-from appliance.tasks.context import PREFIX, CancelAsked, Steered, task_key
-from appliance.tasks.coordinator import Driver
+from appliance.tasks.coordinator import Coordinator
 from appliance.tasks.durations import Durations
+from appliance.tasks.events import CancelAsked, OperatorAsked
 from appliance.tasks.lookahead import expected_starts
 from appliance.tasks.machine import Transition, TransitionKind
-from appliance.tasks.record_writer import Keeper, SupersededError
-from appliance.tasks.records import read_record, unknown, with_unknown
+from appliance.tasks.record_writer import Draft, RecordWriter, SupersededError
+from appliance.tasks.records import PREFIX, read_record, task_key, unknown
 from appliance.tasks.retention import TRIMMED
 from appliance.tasks.scheduler import Scheduler
 from appliance.tasks.steering import may_pause, may_resume, may_retry, proposal_for, revived
 from appliance.tasks.timing import left_s
-from appliance.tasks.views import WAITS, CandidateWhy, TaskWhy, Waits, why, with_waits
+from appliance.tasks.views import WAITS, why, with_waits
 
 ANSWER_S = 2.0
+READ_AT_ONCE = 200
+"""Records that are decoded before others have their turn."""
 
 
 async def newest_tasks(plane: Plane, ask: TasksAsk, driven: Iterable[TaskRecord]) -> TaskList:
@@ -61,32 +66,40 @@ async def newest_tasks(plane: Plane, ask: TasksAsk, driven: Iterable[TaskRecord]
         driven: records of tasks that are driven here, which may be newer than those written.
     """
     found: dict[str, TaskRecord] = {}
-    # Without what is only remembered: there is too much of it to be shown, or read, each time.
-    for stored in await plane.dht.local(PREFIX, leave_out=TRIMMED):
-        if not stored.deleted:
-            with contextlib.suppress(PayloadError):
-                record = read_record(stored.value)
-                found[record.id] = record
+    filtered = history.is_filtered(ask)
+    # Without what is only remembered, unless it is asked for: there is too much of it to be read each time.
+    for number, stored in enumerate(await plane.dht.local(PREFIX, leave_out=None if ask.remembered else TRIMMED)):
+        if number % READ_AT_ONCE == READ_AT_ONCE - 1:
+            await asyncio.sleep(0)
+        # A filter looks at what the owner has: by an older copy a task may match that does not any more.
+        if stored.deleted or (filtered and not plane.dht.owns(stored.key)):
+            continue
+        with contextlib.suppress(PayloadError):
+            record = read_record(stored.value)
+            found[record.id] = record
     found.update({record.id: record for record in driven})
+    most_bytes = plane.config.max_payload_bytes // 2
+    own = history.newest(found.values(), ask, most_bytes=most_bytes)
+    if ask.local:
+        return own
     unreachable: list[str] = []
-    if not ask.local:
-        others = sorted(plane.members() - {plane.gateway})
-        here = replace(ask, local=True)
-        answers = await asyncio.gather(
-            *(plane.rpc.call(other, "tasks", here, TaskList, timeout_s=ANSWER_S) for other in others),
-            return_exceptions=True,
-        )
-        for other, answer in zip(others, answers, strict=True):
-            if isinstance(answer, TaskList):
-                for record in answer.tasks:
-                    if record.id not in found or found[record.id].sequence < record.sequence:
-                        found[record.id] = record
-            elif isinstance(answer, SwiftbotError):
-                unreachable.append(other)
-            else:
-                raise answer
-    newest = sorted(found.values(), key=lambda record: (record.created_ns, record.id), reverse=True)
-    return TaskList(tasks=tuple(newest[: max(0, ask.limit)]), unreachable=tuple(unreachable))
+    lists = [own]
+    others = sorted(plane.members() - {plane.gateway})
+    here = replace(ask, local=True)
+    answers = await asyncio.gather(
+        *(plane.rpc.call(other, keyspace.TASKS, here, timeout_s=ANSWER_S) for other in others),
+        return_exceptions=True,
+    )
+    for other, answer in zip(others, answers, strict=True):
+        if isinstance(answer, TaskList):
+            lists.append(answer)
+        elif isinstance(answer, SwiftbotError):
+            unreachable.append(other)
+        else:
+            raise answer
+    merged, more = history.together(lists)
+    whole = history.newest(merged.values(), ask, most_bytes=most_bytes)
+    return replace(whole, unreachable=tuple(unreachable), more=more or whole.more)
 
 
 STATUS_S = 1.0
@@ -186,13 +199,13 @@ def _rounded(seconds: float | None) -> float | None:
 async def _status(plane: Plane, record: TaskRecord, target: SubtaskRecord) -> RunStatus | None:
     ask = RunAsk(task=record.id, subtask=target.subtask.id, attempt=target.attempt)
     try:
-        return await plane.rpc.call(target.gateway, "run_status", ask, RunStatus, timeout_s=STATUS_S)
+        return await plane.rpc.call(target.gateway, keyspace.RUN_STATUS, ask, timeout_s=STATUS_S)
     except SwiftbotError:
         return None
 
 
 CANCEL_S = 1.5
-"""How long the answer to a cancel waits for the record that it makes: less than whoever asks waits for the answer."""
+"""How long the answer to a cancel waits for the record that it makes: less than the asker waits for the answer."""
 
 
 class Questions:
@@ -201,14 +214,14 @@ class Questions:
     def __init__(
         self,
         plane: Plane,
-        drivers: Mapping[str, Driver],
+        coordinators: Mapping[str, Coordinator],
         *,
         scheduler: Scheduler,
         durations: Durations,
         sweep: asyncio.Event,
     ) -> None:
         self._plane = plane
-        self._drivers = drivers
+        self._coordinators = coordinators
         self._scheduler = scheduler
         self._durations = durations
         self._sweep = sweep
@@ -216,12 +229,12 @@ class Questions:
     async def task(self, ask: TaskAsk) -> TaskRecord:
         """Return a task's record; NotFoundError when there is none.
 
-        A driver's copy is the answer only where the record is this gateway's and has not changed under the driver:
-        after a partition the other side's may stand.
+        A coordinator's copy is the answer only where the record is this gateway's and has not changed under it: after a
+        partition the other side's may stand.
         """
-        driver = self._drivers.get(ask.id)
-        if driver is not None and not driver.overtaken and self._plane.dht.owns(task_key(ask.id)):
-            return driver.told
+        coordinator = self._coordinators.get(ask.id)
+        if coordinator is not None and not coordinator.overtaken and self._plane.dht.owns(task_key(ask.id)):
+            return coordinator.written
         stored = await self._plane.dht.read(task_key(check_name(ask.id, "task")))
         if stored is None or stored.deleted:
             raise NotFoundError(f"there is no task {ask.id}", remedy="see `swiftbot task list`")
@@ -229,28 +242,28 @@ class Questions:
 
     async def why(self, ask: WhyAsk) -> TaskWhy:
         """Tell why a task waits, or was served where it was; its coordinator knows what is in no record."""
-        if driver := self._drivers.get(ask.id):
+        if coordinator := self._coordinators.get(ask.id):
             return await explain(
-                driver.record,
+                coordinator.record,
                 ask.subtask,
                 plane=self._plane,
                 scheduler=self._scheduler,
                 durations=self._durations,
-                elapsed_s=driver.elapsed_s,
+                elapsed_s=coordinator.elapsed_s,
             )
         record = await self.task(TaskAsk(id=ask.id))
         owner = self._plane.ring.owner(task_key(ask.id))
         if not (record.state.final or ask.here or owner == self._plane.gateway):
-            return await self._plane.rpc.call(owner, "why", replace(ask, here=True), TaskWhy)
+            return await self._plane.rpc.call(owner, keyspace.WHY, replace(ask, here=True))
         return why(record, ask.subtask)
 
     async def tasks(self, ask: TasksAsk) -> TaskList:
         """Return the newest tasks, of the whole fleet or of this gateway's shard."""
-        return await newest_tasks(self._plane, ask, [driver.record for driver in self._drivers.values()])
+        return await newest_tasks(self._plane, ask, [coordinator.record for coordinator in self._coordinators.values()])
 
     async def cancel(self, ask: CancelTaskAsk) -> TaskRecord:
         """Stop a task wherever it is coordinated; returns the record that came of it: see `cancel_here`."""
-        if ask.id in self._drivers:
+        if ask.id in self._coordinators:
             return await self.cancel_here(ask)
         record = await self.task(TaskAsk(id=ask.id))
         if record.state.final:
@@ -259,10 +272,10 @@ class Questions:
         if owner == self._plane.gateway:
             self._sweep.set()
             return await self.cancel_here(ask)
-        return await self._plane.rpc.call(owner, "cancel_here", ask, TaskRecord)
+        return await self._plane.rpc.call(owner, keyspace.CANCEL_HERE, ask)
 
     async def cancel_here(self, ask: CancelTaskAsk) -> TaskRecord:
-        """Stop a task that is coordinated here; waits a moment for a driver that is being set up.
+        """Stop a task that is coordinated here; waits a moment for a coordinator that is being set up.
 
         Returns the record as it is written then: cancelled, cancelling while runs are being ended, or how it had ended
         before the cancel came.
@@ -271,15 +284,15 @@ class Questions:
             UnreachableError: nobody coordinates it just now.
         """
         for _ in range(20):
-            if driver := self._drivers.get(ask.id):
-                driver.tell(CancelAsked(Word(by=ask.by, why=ask.why, act=ask.act, at_ns=time.time_ns())))
+            if coordinator := self._coordinators.get(ask.id):
+                coordinator.put(CancelAsked(Word(by=ask.by, why=ask.why, act=ask.act, at_ns=time.time_ns())))
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(CANCEL_S):
-                        await driver.ending.wait()
+                        await coordinator.ending.wait()
                 record = await self.task(TaskAsk(id=ask.id))
-                if not driver.ending.is_set() or record.state.final or record.state is TaskState.CANCELLING:
+                if not coordinator.ending.is_set() or record.state.final or record.state is TaskState.CANCELLING:
                     return record  # what is not written in time stays noted: the record says that it is not confirmed
-                # It has stepped down, since the record changed under it: the next one is told.
+                # It has stepped down, since the record changed under it: the next one gets it.
                 self._sweep.set()
             else:
                 record = await self.task(TaskAsk(id=ask.id))
@@ -302,7 +315,7 @@ class OperatorVerbs:
 
     Args:
         plane: the fleet.
-        drivers: of the tasks that are coordinated here.
+        coordinators: of the tasks that are coordinated here.
         task: returns a task's record.
         drive: begins to drive a record at a version, as it is stored.
         published: hears of each transition that is published.
@@ -312,7 +325,7 @@ class OperatorVerbs:
     def __init__(
         self,
         plane: Plane,
-        drivers: Mapping[str, Driver],
+        coordinators: Mapping[str, Coordinator],
         *,
         task: Callable[[TaskAsk], Awaitable[TaskRecord]],
         drive: Callable[[TaskRecord, VersionVector, bytes], None],
@@ -320,7 +333,7 @@ class OperatorVerbs:
         audit: Audit,
     ) -> None:
         self._plane = plane
-        self._drivers = drivers
+        self._coordinators = coordinators
         self._task = task
         self._drive = drive
         self._published = published
@@ -329,49 +342,49 @@ class OperatorVerbs:
     def register(self) -> None:
         """Answer RPC."""
         rpc, audit = self._plane.rpc, self._audit
-        rpc.register("approve", ApproveAsk, audit.signed("approve", self.approve))
-        rpc.register("reject", RejectAsk, audit.signed("reject", self.reject))
-        rpc.register("pause", PauseAsk, audit.signed("pause", self.pause))
-        rpc.register("resume", ResumeAsk, audit.signed("resume", self.resume))
-        rpc.register("retry", RetryAsk, audit.signed("retry", self.retry))
-        rpc.register("acts", ActsAsk, audit.acts)
+        rpc.register(keyspace.APPROVE, audit.signed("approve", self.approve))
+        rpc.register(keyspace.REJECT, audit.signed("reject", self.reject))
+        rpc.register(keyspace.PAUSE, audit.signed("pause", self.pause))
+        rpc.register(keyspace.RESUME, audit.signed("resume", self.resume))
+        rpc.register(keyspace.RETRY, audit.signed("retry", self.retry))
+        rpc.register(keyspace.ACTS, audit.acts)
 
     async def approve(self, ask: ApproveAsk) -> TaskRecord:
         """Answer `approve`. Errors as `deciding.proposal_for`; PlanError for an edited plan that is not valid."""
-        return await self._steer("approve", ask)
+        return await self._steer(keyspace.APPROVE, ask)
 
     async def reject(self, ask: RejectAsk) -> TaskRecord:
         """Answer `reject`. Errors as `deciding.proposal_for`."""
-        return await self._steer("reject", ask)
+        return await self._steer(keyspace.REJECT, ask)
 
     async def pause(self, ask: PauseAsk) -> TaskRecord:
         """Answer `pause`. Errors as `deciding.may_pause`."""
-        return await self._steer("pause", ask)
+        return await self._steer(keyspace.PAUSE, ask)
 
     async def resume(self, ask: ResumeAsk) -> TaskRecord:
         """Answer `resume`. Errors as `deciding.may_resume`."""
-        return await self._steer("resume", ask)
+        return await self._steer(keyspace.RESUME, ask)
 
     async def retry(self, ask: RetryAsk) -> TaskRecord:
         """Answer `retry`. Errors as `deciding.may_retry`."""
-        return await self._steer("retry", ask)
+        return await self._steer(keyspace.RETRY, ask)
 
-    async def _steer(self, verb: str, ask: A) -> TaskRecord:
-        if ask.here or ask.id in self._drivers:
+    async def _steer(self, verb: Verb[A, TaskRecord], ask: A) -> TaskRecord:
+        if ask.here or ask.id in self._coordinators:
             return await self._here(ask)
         if not is_wanted(await self._task(TaskAsk(id=ask.id)), ask):
             return await self._task(TaskAsk(id=ask.id))
         owner = await self._plane.owner_of(task_key(ask.id))
         if owner == self._plane.gateway:
             return await self._here(ask)
-        return await self._plane.rpc.call(owner, verb, replace(ask, here=True), TaskRecord, timeout_s=STEER_S + 1.0)
+        return await self._plane.rpc.call(owner, verb, replace(ask, here=True), timeout_s=STEER_S + 1.0)
 
     async def _here(self, ask: Ask) -> TaskRecord:
-        """Tell the task's driver; waits a moment for one that is being set up."""
+        """Hand it to the task's coordinator; waits a moment for one that is being set up."""
         for _ in range(TRIES):
-            if driver := self._drivers.get(ask.id):
+            if coordinator := self._coordinators.get(ask.id):
                 outcome: asyncio.Future[TaskRecord] = asyncio.get_running_loop().create_future()
-                driver.tell(Steered(ask=ask, outcome=outcome))
+                coordinator.put(OperatorAsked(ask=ask, outcome=outcome))
                 try:
                     async with asyncio.timeout(STEER_S):
                         return await outcome
@@ -396,18 +409,19 @@ class OperatorVerbs:
         fields = revived(record, ask, elapsed_s=record.elapsed_s)
         if fields is None:
             return record
-        keeper = Keeper(self._plane, record, stored.version, lambda _: None)
-        keeper.unknown = unknown(stored.value)
-        keeper.on_published = self._published
-        keeper.apply(keeper.transition(TransitionKind.RETRIED, **fields))
+        draft = Draft(record, self._plane.gateway)
+        writer = RecordWriter(
+            self._plane, draft, stored.version, unknown=unknown(stored.value), on_published=self._published
+        )
+        draft.apply(TransitionKind.RETRIED, **fields)
         try:
-            await keeper.flush()
+            await writer.flush()
         except SupersededError:
             now = await self._task(TaskAsk(id=ask.id))
             who = now.retried_by.by if now.retried_by is not None else "somebody else"
             raise ConflictError(f"{who} has had task {ask.id} tried again already") from None
-        self._drive(keeper.record, keeper.version, with_unknown(keeper.record, keeper.unknown))
-        return keeper.record
+        self._drive(draft.record, writer.version, writer.value)
+        return draft.record
 
 
 def is_wanted(record: TaskRecord, ask: Ask) -> bool:

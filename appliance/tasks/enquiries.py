@@ -1,4 +1,4 @@
-"""Questions of handlers to people: kept in the DHT until they are answered, put for whoever watches; first answer wins.
+"""Questions of handlers to people: kept in the DHT until they are answered, published; first answer wins.
 
 A question has the id of its effect (`task:subtask:n`), the same in a repeated attempt: a gateway that dies while
 somebody thinks takes nothing along, and what was answered meanwhile is there for the next attempt.
@@ -13,6 +13,7 @@ import msgspec
 import structlog
 from msgspec.structs import replace
 
+from appliance.background import Background
 from appliance.errors import (
     ConflictError,
     DeadlineError,
@@ -22,17 +23,16 @@ from appliance.errors import (
     SwiftbotError,
     UnreachableError,
 )
-from appliance.model import Enquiry, encode
+from appliance.model import Enquiry, encode, keyspace
+from appliance.model.task_api import AnswerAsk, EnquiriesAsk, EnquiryList
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer
-from appliance.tasks.api import AnswerAsk, EnquiriesAsk, EnquiryList
 from appliance.tasks.audit import Audit
 from appliance.tasks.records import clean
 
 log = structlog.get_logger(__name__)
 
-PREFIX = "ask/"
 MAX_QUESTION = 1000
 MAX_CHOICES = 20
 MAX_CHOICE = 100
@@ -50,21 +50,19 @@ class Enquiries:
         self._plane = plane
         self._heard: dict[str, asyncio.Event] = {}
         self._closer: Closer | None = None
-        self._closing: set[asyncio.Task[None]] = set()
+        self._closing = Background()
 
     def start(self, audit: Audit) -> None:
         """Listen, and answer the verbs."""
-        self._closer = self._plane.session.subscribe_typed(self._plane.keys.enquiry(), Enquiry, self._on_enquiry)
-        self._plane.rpc.register("answer", AnswerAsk, audit.signed("answer", self.answer))
-        self._plane.rpc.register("enquiries", EnquiriesAsk, self.enquiries)
+        self._closer = self._plane.session.subscribe_typed(keyspace.ENQUIRY, self._on_enquiry)
+        self._plane.rpc.register(keyspace.ANSWER, audit.signed("answer", self.answer))
+        self._plane.rpc.register(keyspace.ENQUIRIES, self.enquiries)
 
     async def close(self) -> None:
         """Listen no more."""
         if self._closer is not None:
             self._closer.close()
-        for task in self._closing:
-            task.cancel()
-        await asyncio.gather(*self._closing, return_exceptions=True)
+        await self._closing.close()
 
     async def ask(self, enquiry: Enquiry, *, on_wait: Callable[[str], None]) -> Enquiry:
         """Ask people and wait for the answer.
@@ -91,19 +89,17 @@ class Enquiries:
                         break
                     raise DeadlineError(
                         f"nobody answered within {enquiry.expires_s:.0f} s: {enquiry.question}",
-                        remedy="`swiftbot asks` lists what waits for an answer",
+                        remedy="`swiftbot questions` lists what waits for an answer",
                     )
                 on_wait(f"waits for an answer: {enquiry.question}")
                 heard.clear()
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(min(LOOK_S, left_s)):
                         await heard.wait()
-                with contextlib.suppress(UnreachableError):  # whoever has it may be back before the time is over
+                with contextlib.suppress(UnreachableError):  # its owner may be back before the time is over
                     now = await self._read(enquiry.id) or now
         except asyncio.CancelledError:
-            task = asyncio.create_task(self._withdraw(enquiry.id), name=f"withdraw {enquiry.id}")
-            self._closing.add(task)
-            task.add_done_callback(self._closing.discard)
+            self._closing.start(self._withdraw(enquiry.id), f"withdraw {enquiry.id}")
             raise
         else:
             return now
@@ -123,7 +119,7 @@ class Enquiries:
             stored = await self._stored(ask.id)
             enquiry = _decoded(stored)
             if stored is None or enquiry is None:
-                raise NotFoundError(f"there is no question {ask.id[:80]!r}", remedy="`swiftbot asks` lists them")
+                raise NotFoundError(f"there is no question {ask.id[:80]!r}", remedy="`swiftbot questions` lists them")
             if enquiry.answer is not None:
                 if (enquiry.by, enquiry.answer) == (ask.by, clean(ask.answer, len(ask.answer))):
                     return enquiry
@@ -135,14 +131,14 @@ class Enquiries:
                 await self._plane.dht.write(_key(ask.id), encode(answered), expected=stored.version)
             except ConflictError:
                 continue
-            self._plane.session.put(self._plane.keys.enquiry(answered.id), encode(answered))
+            self._plane.session.publish(keyspace.ENQUIRY, answered, answered.id)
             return answered
         raise ConflictError(f"the question {ask.id} changes just now", remedy="ask again")
 
     async def enquiries(self, ask: EnquiriesAsk) -> EnquiryList:
         """Answer `enquiries`."""
         found: dict[str, Enquiry] = {}
-        for record in await self._plane.dht.local(PREFIX):
+        for record in await self._plane.dht.local(keyspace.ENQUIRY_RECORD.prefix):
             enquiry = _decoded(record) if self._plane.dht.owns(record.key) else None
             if enquiry is not None and enquiry.open:
                 found[enquiry.id] = enquiry
@@ -159,9 +155,7 @@ class Enquiries:
 
     async def _local_of(self, member: str) -> EnquiryList | None:
         try:
-            return await self._plane.rpc.call(
-                member, "enquiries", EnquiriesAsk(local=True), EnquiryList, timeout_s=LIST_S
-            )
+            return await self._plane.rpc.call(member, keyspace.ENQUIRIES, EnquiriesAsk(local=True), timeout_s=LIST_S)
         except SwiftbotError:
             return None
 
@@ -181,7 +175,7 @@ class Enquiries:
                 version = stored.version if stored is not None else None  # asked in vain before: it is open again
             else:
                 break
-        self._plane.session.put(self._plane.keys.enquiry(enquiry.id), encode(enquiry))
+        self._plane.session.publish(keyspace.ENQUIRY, enquiry, enquiry.id)
         log.info("people are asked", enquiry=enquiry.id, question=enquiry.question, robot=enquiry.robot)
         return enquiry
 
@@ -202,7 +196,7 @@ class Enquiries:
             await self._plane.dht.write(_key(name), encode(shut), expected=stored.version)
         except ConflictError:
             return await self._read(name)
-        self._plane.session.put(self._plane.keys.enquiry(name), encode(shut))
+        self._plane.session.publish(keyspace.ENQUIRY, shut, name)
         return shut
 
     async def _read(self, name: str) -> Enquiry | None:
@@ -264,7 +258,7 @@ def stronger(one: bytes, other: bytes) -> bytes:
 
 
 def _key(name: str) -> str:
-    return PREFIX + name.replace(":", "/")
+    return keyspace.ENQUIRY_RECORD.prefix + name.replace(":", "/")
 
 
 def _decoded(stored: Record | None) -> Enquiry | None:

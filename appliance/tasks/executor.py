@@ -14,22 +14,22 @@ from typing import Any, Protocol
 
 import msgspec
 import structlog
-from msgspec import Struct
 from msgspec.structs import replace
 
+from appliance.background import Background
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
-from appliance.model import Failure, Phase, PoolHint, RunAccepted, RunEvent, RunEventKind, RunRequest, encode
-from appliance.plane.keys import check_name, run_of
+from appliance.model import Failure, Phase, PoolHint, RunAccepted, RunEvent, RunEventKind, RunRequest, encode, keyspace
+from appliance.model.keys import check_name
+from appliance.model.pool_api import Hinted
+from appliance.model.task_api import RunAsk, RunStatus
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer, Message
-from appliance.pool.api import Hinted
 from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import Decision
-from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.checkpoints import Checkpoints
-from appliance.tasks.context import task_key
+from appliance.tasks.handoff import Here, Reservations
 from appliance.tasks.offload import Choosing, Elsewhere, PassedOn, Passing, RemoteContainers, whereabouts
-from appliance.tasks.records import MAX_NOTE, MAX_RUN_S, clean, read_record, tidy
+from appliance.tasks.records import MAX_NOTE, MAX_RUN_S, clean, read_record, task_key, tidy
 from appliance.tasks.settings import TasksConfig
 
 MOST_RUNS = 4000
@@ -37,13 +37,15 @@ MOST_RUNS = 4000
 
 
 class Telling:
-    """The voice of one gateway's runs. `on_told` hears all that is published."""
+    """Publishes the events of one gateway's runs; `on_event` gets each of them too."""
 
-    def __init__(self, plane: Plane) -> None:
+    def __init__(self, plane: Plane, *, on_event: Callable[[RunEvent], None] = lambda _: None) -> None:
         self._plane = plane
+        self._on_event = on_event
         self._numbers: OrderedDict[tuple[str, str, int], int] = OrderedDict()
         self._heard: dict[tuple[str, str, int], float] = {}
-        self.on_told: Callable[[RunEvent], None] = lambda _: None
+        self._progress: dict[tuple[str, str, int], float] = {}
+        """Of the run, as it said last."""
 
     def tell(self, event: RunEvent) -> None:
         """Publish an event."""
@@ -53,11 +55,30 @@ class Telling:
         self._numbers[run] = number
         self._numbers.move_to_end(run)
         self._heard[run] = time.monotonic()
+        if event.kind is RunEventKind.PROGRESS:
+            self._progress[run] = event.progress
         while len(self._numbers) > MOST_RUNS:
-            self._heard.pop(self._numbers.popitem(last=False)[0], None)
+            oldest, _ = self._numbers.popitem(last=False)
+            self._heard.pop(oldest, None)
+            self._progress.pop(oldest, None)
         event = replace(event, number=number, at_ns=time.time_ns())
-        self._plane.session.put(self._plane.keys.run(event.task, event.subtask), encode(event), express=True)
-        self.on_told(event)
+        self._plane.session.publish(keyspace.RUN_EVENT, event, event.task, event.subtask, express=True)
+        self._on_event(event)
+
+    def waits(self, call: Call, note: str) -> None:
+        """Publish that a run waits for something, as its progress."""
+        run = call.run
+        self.tell(
+            RunEvent(
+                task=run.task,
+                subtask=run.subtask,
+                attempt=run.attempt,
+                kind=RunEventKind.PROGRESS,
+                gateway=self._plane.gateway,
+                progress=self._progress.get((run.task, run.subtask, run.attempt), 0.0),
+                note=clean(note, MAX_NOTE),
+            )
+        )
 
     def silent_s(self, task: str, subtask: str, attempt: int) -> float | None:
         """Return the seconds since a run's last sign of life; None when nothing was told of it."""
@@ -153,20 +174,30 @@ class KeptRuns:
         return self._store.delete(f"{_PREFIX}{run_id}")
 
 
-class Here(Struct):
-    """A run in progress on this gateway."""
-
-    request: RunRequest
-    since: float
-    """When it was accepted, on this machine's monotonic clock."""
-    began: bool = False
-    """Whether its handler has run its first line."""
-
-
 class Executor:
-    """The runs of one gateway."""
+    """The runs of one gateway.
 
-    def __init__(self, plane: Plane, pool: Pool, remote: RemoteContainers, config: TasksConfig) -> None:
+    Args:
+        plane: the fleet.
+        pool: this gateway's containers.
+        remote: other gateways' containers.
+        config: section `[tasks]`.
+        telling: publishes the runs' events.
+        reservations: containers here for runs that come from other gateways.
+        on_change: called when the number of runs, or whether they drain, has changed.
+    """
+
+    def __init__(
+        self,
+        plane: Plane,
+        pool: Pool,
+        remote: RemoteContainers,
+        config: TasksConfig,
+        *,
+        telling: Telling | None = None,
+        reservations: Reservations | None = None,
+        on_change: Callable[[], None] = lambda: None,
+    ) -> None:
         self._plane = plane
         self._config = config
         self._remote = remote
@@ -181,19 +212,18 @@ class Executor:
         self._choosing = Choosing(plane, pool, remote, check=self._check)
         self._passing = Passing(plane, pool, Elsewhere(plane, pool, remote, self._order_of))
         self._kept = KeptRuns(plane.store, plane.gateway)
-        self._background: set[asyncio.Future[object]] = set()
-        self.telling = Telling(plane)
+        self._background = Background()
+        self._telling = telling or Telling(plane)
         self._checkpoints = Checkpoints(
             plane.dht,
             gateway=plane.gateway,
             max_bytes=config.max_checkpoint_bytes,
-            tell=self.telling.tell,
+            tell=self._telling.tell,
             refuse=lambda what, reason: plane.session.refuse(what, reason=reason),
         )
         self.draining = False
-        self.on_change: Callable[[], None] = lambda: None
-        self.reserved: Callable[[RunRequest], Decision | None] = lambda _: None
-        """The container that is held for a run which is moved here, if there is one."""
+        self._on_change = on_change
+        self._reservations = reservations or Reservations(plane.gateway, pool)
 
     @property
     def running(self) -> int:
@@ -207,9 +237,9 @@ class Executor:
     async def start(self) -> None:
         """Load what was kept; a run that was in progress when the gateway went down has failed."""
         session, keys = self._plane.session, self._plane.keys
-        self._closers.append(session.subscribe(keys.task(), self._on_record))
+        self._closers.append(session.subscribe(keys(keyspace.TASK_UPDATE), self._on_record))
         sent = session.subscribe_typed(
-            keys.run(), RunEvent, self._on_event, heed=lambda key: self._remote.waits_for(run_of(key))
+            keyspace.RUN_EVENT, self._on_event, heed=lambda key: self._remote.waits_for(keyspace.RUN_EVENT.names(key))
         )
         self._closers.append(sent)
         self._passing.moved.update(await self._kept.load())
@@ -233,7 +263,7 @@ class Executor:
             return self._accepted[run_id]
         accepting = self._accepting.get(run_id)
         if accepting is None:
-            # A task of its own: the same order may come twice, and whoever asked may go away, while it is decided.
+            # A task of its own: the same order may come twice, and the asker may go away, while it is decided.
             accepting = asyncio.create_task(self._accept(request), name=f"accept {run_id}")
             self._accepting[run_id] = accepting
             accepting.add_done_callback(lambda done: self._decided(run_id, done))
@@ -243,20 +273,20 @@ class Executor:
         del self._accepting[run_id]
         self._withdrawn.discard(run_id)
         if not done.cancelled():
-            done.exception()  # whoever asked has it; if nobody waits any more, nobody misses it
+            done.exception()  # the asker has it; if nobody waits any more, nobody misses it
 
     async def _accept(self, request: RunRequest) -> RunAccepted:
         run_id = request.run_id
         self._check(request)
         await self._end_older(request)
         received_ns = time.monotonic_ns()
-        decision = self.reserved(request) or await self._choosing.choose(request)
+        decision = self._reservations.take(request)
+        if decision is None:
+            chooser = self._reservations.reserve if request.hops else self._choosing.choose
+            decision = await chooser(request)
         if isinstance(decision, RunAccepted):
             self._sent_on(request, decision)
             return decision
-        if request.hops and decision.phase is Phase.COLD and not (request.anew and self._pool.has_room(request.need)):
-            what = "room for a new container" if request.anew else f"ready container of {request.need.image}"
-            raise RefusedError(f"{self._plane.gateway} has no {what} any more")
         # Much may have happened while other gateways were asked.
         self._check(request)
         phase = _seen_from_afar(decision.phase, request) or decision.phase
@@ -273,20 +303,20 @@ class Executor:
         self._running[run_id] = task
         self._here[run_id] = Here(request, time.monotonic())
         task.add_done_callback(lambda done: self._ended(run_id, done))
-        self.on_change()
+        self._on_change()
         return accepted
 
     def _sent_on(self, request: RunRequest, accepted: RunAccepted) -> None:
         """Note where a run went that never began here: this gateway is asked after it until its record names the other.
 
-        Whoever asks may be a coordinator that took over just now; told that nobody knows of the run, it would begin the
+        The asker may be a coordinator that took over just now; told that nobody knows of the run, it would begin the
         next attempt beside it. The same order again has the same answer.
         """
         run_id, event = request.run_id, whereabouts(request, accepted)
         self._accepted[run_id] = accepted
         self._passing.moved[run_id] = accepted.gateway
         self._remember(run_id, event)
-        self._later(self._kept.keep(run_id, event))
+        self._background.start(self._kept.keep(run_id, event), "tidy up after a run")
 
     def _check(self, request: RunRequest) -> None:
         """Refuse what must not begin (any more)."""
@@ -312,7 +342,7 @@ class Executor:
             if told.kind is RunEventKind.CHECKPOINT:
                 self._checkpoints.add(told)
             else:
-                self.telling.tell(told)
+                self._telling.tell(told)
 
         begun = asyncio.create_task(self._kept.keep(run_id, self._kept.last[run_id]))
         try:
@@ -328,36 +358,20 @@ class Executor:
             )
         if isinstance(final, PassedOn):
             self._remember(run_id, final.event)
-            self.telling.tell(final.event)
+            self._telling.tell(final.event)
             await begun
             await self._kept.keep(run_id, final.event)
             if run_id in self._withdrawn:
-                await self._passing.ask(run_id, "run_cancel")
+                await self._passing.ask(run_id, keyspace.RUN_CANCEL)
             return
         final = replace(final, gateway=self._plane.gateway, phase=_seen_from_afar(final.phase, request))
         final = tidy(final, max_result_bytes=self._config.max_result_bytes)
         self._remember(run_id, final)
         await begun
         await self._checkpoints.end(final)
-        # Kept before it is told: a coordinator that misses the event finds it here.
+        # Kept before it is published: a coordinator that misses the event finds it here.
         await self._kept.keep(run_id, final)
-        self.telling.tell(final)
-
-    def waits(self, call: Call, note: str) -> None:
-        """Tell that a run waits for something, as its progress."""
-        run = call.run
-        last = self._kept.last.get(run.run_id)
-        self.telling.tell(
-            RunEvent(
-                task=run.task,
-                subtask=run.subtask,
-                attempt=run.attempt,
-                kind=RunEventKind.PROGRESS,
-                gateway=self._plane.gateway,
-                progress=last.progress if last else 0.0,
-                note=clean(note, MAX_NOTE),
-            )
-        )
+        self._telling.tell(final)
 
     def _remember(self, run_id: str, event: RunEvent) -> None:
         for oldest in self._kept.remember(run_id, event, busy=self._running.keys()):
@@ -366,7 +380,7 @@ class Executor:
     def _forget(self, run_id: str) -> None:
         self._accepted.pop(run_id, None)
         self._passing.moved.pop(run_id, None)
-        self._later(self._kept.forget(run_id))
+        self._background.start(self._kept.forget(run_id), "tidy up after a run")
 
     async def _end_older(self, request: RunRequest) -> None:
         """End an outdated attempt that still runs here, or is about to."""
@@ -384,7 +398,7 @@ class Executor:
 
     def _on_record(self, message: Message) -> None:
         """End runs whose attempt the record has left behind; forget the runs of a task that has ended."""
-        task = message.key.split("/")[-2]
+        (task,) = keyspace.TASK_UPDATE.names(message.key)
         mine = [run_id for run_id in self._kept.last if run_id.startswith(f"{task}/")]
         coming = [run_id for run_id in self._accepting if run_id.startswith(f"{task}/")]
         if not (mine or coming) or message.deleted:
@@ -408,9 +422,9 @@ class Executor:
             outdated = gone or event.attempt < attempts.get(event.subtask, 0)
             if run_id in self._running:
                 if record.state.final:
-                    self._later(self._end(run_id))
+                    self._background.start(self._end(run_id), "tidy up after a run")
                 elif outdated:
-                    self._later(self._end_outdated(event))
+                    self._background.start(self._end_outdated(event), "tidy up after a run")
             elif record.state.final:
                 self._forget(run_id)
 
@@ -433,16 +447,6 @@ class Executor:
                 return
         await self._end(f"{event.task}/{event.subtask}/{event.attempt}")
 
-    def _later(self, work: Coroutine[Any, Any, object]) -> None:
-        task = asyncio.ensure_future(work)
-        self._background.add(task)
-        task.add_done_callback(self._background_done)
-
-    def _background_done(self, done: "asyncio.Future[object]") -> None:
-        self._background.discard(done)
-        if not done.cancelled() and (error := done.exception()) is not None:
-            log.warning("tidying up after a run failed", reason=str(error))
-
     def _ended(self, run_id: str, done: "asyncio.Task[None]") -> None:
         self._running.pop(run_id, None)
         self._here.pop(run_id, None)
@@ -450,7 +454,7 @@ class Executor:
         if not done.cancelled() and (error := done.exception()) is not None:
             # The coordinator asks after the run, sees that it has ended with nothing, and repeats it.
             log.error("run was not brought to its end", run=run_id, exc_info=error)
-        self.on_change()
+        self._on_change()
 
     async def hint(self, hint: PoolHint) -> Hinted:
         """Tell the pool here what a plan will need of it."""
@@ -459,14 +463,14 @@ class Executor:
     async def status(self, ask: RunAsk) -> RunStatus:
         """Tell what is known of a run; one that was passed on is asked after where it is."""
         if ask.run_id in self._passing.moved:
-            return await self._passing.ask(ask.run_id, "run_status")
+            return await self._passing.ask(ask.run_id, keyspace.RUN_STATUS)
         running = ask.run_id in self._running or ask.run_id in self._accepting
         waiting = [turn.id for turn, _ in self._pool.waiting()] if running else []
         position = waiting.index(ask.run_id) + 1 if ask.run_id in waiting else 0
         return RunStatus(
             running=running,
             last=self._kept.last.get(ask.run_id),
-            silent_s=self.telling.silent_s(ask.task, ask.subtask, ask.attempt) if running and not position else None,
+            silent_s=self._telling.silent_s(ask.task, ask.subtask, ask.attempt) if running and not position else None,
             position=position,
             queue=len(waiting) if position else 0,
             expected_s=self._pool.expected_s(position) if position else None,
@@ -483,7 +487,7 @@ class Executor:
         if ask.run_id in self._accepting:
             self._withdrawn.add(ask.run_id)
         if ask.run_id in self._passing.moved:
-            return await self._passing.ask(ask.run_id, "run_cancel")
+            return await self._passing.ask(ask.run_id, keyspace.RUN_CANCEL)
         if ask.run_id in self._running:
             await self._end(ask.run_id)
         return await self.status(ask)
@@ -520,7 +524,7 @@ class Executor:
     async def drain(self, deadline_s: float) -> None:
         """Accept nothing more and wait for the runs in progress; what is left then is cancelled."""
         self.draining = True
-        self.on_change()
+        self._on_change()
         try:
             if self._running:
                 await asyncio.wait(list(self._running.values()), timeout=deadline_s)
@@ -533,8 +537,7 @@ class Executor:
             self._passing.stop()
             for each in self._closers:
                 each.close()
-            if self._background:
-                await asyncio.wait(list(self._background), timeout=2.0)
+            await self._background.finish(2.0)
 
 
 def _number(run_id: str) -> int:

@@ -1,7 +1,7 @@
 """What a handler may ask of the appliance while it runs: robot commands, notices, questions to people, files.
 
 Every effect has the id `task/subtask/n`, n being the number of the call within the handler, the same in a
-repeated attempt; whoever carries it out does it once per id. So a gateway that dies between doing and
+repeated attempt; it is carried out once per id. So a gateway that dies between doing and
 telling never doubles an effect.
 """
 
@@ -18,17 +18,17 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, PayloadError, RobotError, SwiftbotError, from_code
-from appliance.model import Notice, RobotCommand, RobotReply, encode
-from appliance.plane.keys import check_name
+from appliance.model import Notice, RobotCommand, RobotReply, encode, keyspace
+from appliance.model.keys import check_name
+from appliance.model.task_api import ArtifactAsk, ArtifactPiece
 from appliance.plane.node import Plane
 from appliance.pool.pool import Call
 from appliance.robots.limits import CHOSEN
 from appliance.robots.sender import send_command
-from appliance.tasks.api import ArtifactAsk, ArtifactPiece
-from appliance.tasks.artifacts import Artifacts
+from appliance.tasks.artifacts import ArtifactCopies, Artifacts
 from appliance.tasks.enquiries import Enquiries, enquiry_of
 from appliance.tasks.placement import waits_for_lost
-from appliance.tasks.records import MAX_RUN_S, clean
+from appliance.tasks.records import MAX_RUN_S, clean, task_key
 
 log = structlog.get_logger(__name__)
 
@@ -53,6 +53,7 @@ class Calls:
         plane: Plane,
         artifacts: Artifacts,
         *,
+        copies: ArtifactCopies | None = None,
         on_wait: Callable[[Call, str], None],
         hindrance: Callable[[str], str] = lambda _: "",
         enquiries: Enquiries | None = None,
@@ -63,6 +64,7 @@ class Calls:
         Args:
             plane: the fleet.
             artifacts: files of handlers.
+            copies: has each copied to other gateways; None: they stay here alone.
             on_wait: told what a call waits for.
             hindrance: why a robot may not be commanded just now, "" when it may.
             enquiries: takes questions to people.
@@ -74,6 +76,7 @@ class Calls:
         self._hindrance = hindrance
         self._plane = plane
         self._artifacts = artifacts
+        self._copies = copies
         self._on_wait = on_wait
 
     async def __call__(self, call: Call) -> dict[str, Any]:
@@ -173,7 +176,7 @@ class Calls:
     async def _notify(self, call: Call) -> dict[str, Any]:
         effect = _effect(call)
         to = _NOT_A_NAME.sub("_", str(call.args.get("to", "operator")).lower()).strip("_.-")[:60] or "operator"
-        key = f"effect/{effect}"
+        key = keyspace.EFFECT_RECORD.prefix + effect
         version = None
         try:
             version = await self._plane.dht.write(key, encode(_Effect(done=False)), expected=None)
@@ -190,7 +193,7 @@ class Calls:
             gateway=self._plane.gateway,
             at_ns=time.time_ns(),
         )
-        self._plane.session.put(self._plane.keys.notice(notice.to), encode(notice))
+        self._plane.session.publish(keyspace.NOTICE, notice, notice.to)
         try:
             await self._plane.dht.write(key, encode(_Effect(done=True)), expected=version)
         except ConflictError:
@@ -221,9 +224,15 @@ class Calls:
                 raise PayloadError(f"the file's bytes are not base64: {error}") from error
         if not isinstance(data, bytes):
             raise PayloadError("put_artifact needs bytes", remedy="encode text first")
+        owner = call.run.owner or task_key(call.run.task)
         reference = await self._artifacts.put(
-            str(call.args.get("name", "file")), data, str(call.args.get("media_type", "application/octet-stream"))
+            str(call.args.get("name", "file")),
+            data,
+            str(call.args.get("media_type", "application/octet-stream")),
+            owner=owner,
         )
+        if self._copies is not None:
+            self._copies.later(reference, owner)
         return cast("dict[str, Any]", msgspec.to_builtins(reference))
 
     async def _get(self, call: Call) -> dict[str, Any]:
@@ -232,9 +241,14 @@ class Calls:
             raise PayloadError("get_artifact needs a reference from a result")
 
         async def ask(member: str, piece: ArtifactAsk) -> ArtifactPiece:
-            return await self._plane.rpc.call(member, "artifact", piece, ArtifactPiece)
+            return await self._plane.rpc.call(member, keyspace.ARTIFACT, piece)
 
-        data = await self._artifacts.get(cast("dict[str, Any]", reference), ask=ask, members=self._plane.members())
+        data = await self._artifacts.get(
+            cast("dict[str, Any]", reference),
+            ask=ask,
+            members=self._plane.members(),
+            owner=call.run.owner or task_key(call.run.task),
+        )
         return {"data": data}
 
 

@@ -4,68 +4,16 @@ Each has the gateway that said it, the number by which that source counts, and t
 are in the order of their numbers, whatever clocks say; a number that is missing is a line that was missed.
 """
 
-from enum import StrEnum
 from typing import Any
 
-from msgspec import Struct, field
-
 from appliance.model import LogLine, Notice, RunEvent, RunEventKind
+from appliance.model.task_api import Line, LineKind
+from appliance.model.transitions import Transition, TransitionKind
 from appliance.tasks.records import clean
-from appliance.tasks.transition import Transition, TransitionKind
 
 MAX_TEXT = 500
 MAX_FIELDS = 24
 MAX_FIELD = 200
-
-
-class LineKind(StrEnum):
-    """What a line tells."""
-
-    STATE = "state"
-    """The record has changed: an input of the task's state machine, by its coordinator."""
-    MONITOR = "monitor"
-    """The same, where the monitor or replanning has found or done something."""
-    PROGRESS = "progress"
-    LOG = "log"
-    """A line of a handler."""
-    GATEWAY = "gateway"
-    """A log line of a gateway about the task."""
-    PARTIAL = "partial"
-    CHECKPOINT = "checkpoint"
-    METRICS = "metrics"
-    """How long it took to start and to run, CPU time, memory, container, phase."""
-    NOTICE = "notice"
-    """A message to a person."""
-    DROPPED = "dropped"
-    """So many lines are missing here."""
-
-
-class Line(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """One line of a task's stream."""
-
-    kind: LineKind
-    task: str
-    at_ns: int
-    """Unix nanoseconds by the clock of the gateway that said it; in a merged stream by the reader's own."""
-    gateway: str = ""
-    subtask: str = ""
-    attempt: int = 0
-    level: str = "info"
-    text: str = ""
-    fields: dict[str, Any] = field(default_factory=dict[str, Any])
-    source: str = ""
-    """Who counts `number`: a run, a gateway's log, the record."""
-    number: int = 0
-
-    @property
-    def key(self) -> tuple[str, str, int, int]:
-        """What tells one line from another, however it came, before its time was brought to the reader's clock."""
-        return (self.gateway, self.source, self.number, self.at_ns)
-
-    @property
-    def counted(self) -> bool:
-        """Whether its source counts nothing but lines of this stream, so that a number left out is a line missed."""
-        return self.source.startswith("run ")
 
 
 _MONITORED = frozenset(
@@ -211,7 +159,7 @@ def _ms(value: float | None) -> str:
 
 
 def _small(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields cut to size: a stream is for people, and whoever wants all reads the record or the log."""
+    """Fields cut to size: a stream is for people; all of it is in the record and the log."""
     found: dict[str, Any] = {}
     for name, value in list(fields.items())[:MAX_FIELDS]:
         if isinstance(value, bool | int | float) or value is None:

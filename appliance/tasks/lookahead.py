@@ -15,25 +15,26 @@ from collections.abc import Awaitable, Callable, Mapping
 import structlog
 from msgspec import Struct
 
-from appliance.errors import NotFoundError, SwiftbotError
-from appliance.model import Need, PoolHint, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
+from appliance.background import Background
+from appliance.errors import SwiftbotError
+from appliance.model import Need, PoolHint, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState, keyspace
+from appliance.model.pool_api import Hinted
 from appliance.plane.node import Plane
-from appliance.pool.api import Hinted
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.context import need_of
 from appliance.tasks.durations import Durations
+from appliance.tasks.orders import need_of
 
 log = structlog.get_logger(__name__)
 
 HORIZON_S = 300.0
-"""What is needed later is told later: expectations so far ahead are mostly wrong."""
+"""What is needed later is announced later: expectations so far ahead are mostly wrong."""
 KEEP_S = 30.0
 """How long beyond its time a container is worth keeping at least: subtasks ahead of it take longer than expected."""
 MOST_KEEP_S = 600.0
 SAME_S = 1.0
 """A change of the expected time by less is none, nor one by less than a fifth of what is left."""
 AGAIN_S = 15.0
-"""A hint is told again after so long: the one before may have been met by a run of somebody else."""
+"""A hint is sent again after so long: the one before may have been met by a run of somebody else."""
 MOST_AT_ONCE = 32
 """Hints on their way; more are left for the next change of their plans."""
 TELL_S = 1.0
@@ -139,7 +140,7 @@ class Hinting:
         self._tell = tell
         self._clock = clock
         self._told: dict[str, dict[tuple[str, str], _Told]] = {}
-        self._sending: set[asyncio.Task[None]] = set()
+        self._sending = Background()
 
     def update(self, task: str, wanted: Mapping[tuple[str, str], PoolHint]) -> None:
         """Tell what has changed since the last time; nothing is waited for. An empty mapping takes all back."""
@@ -158,11 +159,9 @@ class Hinting:
             del self._told[task]
 
     def _send(self, gateway: str, hint: PoolHint) -> bool:
-        if len(self._sending) >= MOST_AT_ONCE:
+        if self._sending.count >= MOST_AT_ONCE:
             return False
-        task = asyncio.create_task(self._carry(gateway, hint), name=f"hint to {gateway}")
-        self._sending.add(task)
-        task.add_done_callback(self._sending.discard)
+        self._sending.start(self._carry(gateway, hint), f"hint to {gateway}")
         return True
 
     async def _carry(self, gateway: str, hint: PoolHint) -> None:
@@ -177,8 +176,7 @@ class Hinting:
 
     def close(self) -> None:
         """Tell nothing more."""
-        for task in self._sending:
-            task.cancel()
+        self._sending.cancel()
 
 
 def _same(before: _Told, hint: PoolHint, now: float) -> bool:
@@ -191,7 +189,7 @@ def _same(before: _Told, hint: PoolHint, now: float) -> bool:
 
 
 MOST_AHEAD = 16
-"""Subtasks of one task that pools are told of, those expected first."""
+"""Subtasks of one task that pools get hints of, those expected first."""
 
 
 class LookAhead:
@@ -199,37 +197,33 @@ class LookAhead:
 
     Args:
         plane: the fleet.
-        manifest: a skill's manifest; NotFoundError when it is not known.
+        manifests: by skill, of those known here.
         likely_place: the gateway that a subtask would be sent to now, or "".
-        tell_here: tells this gateway's own pool.
         experience_s: skill, robot -> how long it takes there by what all gateways tell; None when that is not known.
     """
 
     def __init__(
         self,
         plane: Plane,
+        manifests: Mapping[str, SkillManifest],
         *,
-        manifest: Callable[[str], SkillManifest],
         likely_place: Callable[[TaskRecord, SubtaskRecord], str],
-        tell_here: Callable[[PoolHint], Awaitable[Hinted]],
         experience_s: Callable[[str, str], float | None] = lambda _skill, _robot: None,
     ) -> None:
         self.durations = Durations(plane.store)
         self._plane = plane
-        self._manifest = manifest
+        self._manifests = manifests
         self._likely_place = likely_place
-        self._tell_here = tell_here
         self._experience_s = experience_s
         self._hinting = Hinting(self._tell)
 
     def plan_moved(self, record: TaskRecord, running_s: Mapping[str, float]) -> None:
         """Tell pools what the subtasks that are not ready will need; `running_s`: how long each active one has."""
-        manifests: dict[str, SkillManifest] = {}
-        for each in record.subtasks:
-            try:
-                manifests[each.subtask.id] = self._manifest(each.subtask.skill)
-            except NotFoundError:
-                continue  # planned on a gateway that knows more skills
+        manifests = {
+            target.subtask.id: self._manifests[target.subtask.skill]
+            for target in record.subtasks
+            if target.subtask.skill in self._manifests  # else planned on a gateway that knows more skills
+        }
         seconds = {
             each.subtask.id: self.expected_s(each.subtask, each.bound_robot or "")
             for each in record.subtasks
@@ -258,9 +252,7 @@ class LookAhead:
         return max(experience_s, asked) if isinstance(asked, int | float) and 0 < asked < 86_400 else experience_s
 
     async def _tell(self, gateway: str, hint: PoolHint) -> Hinted:
-        if gateway == self._plane.gateway:
-            return await self._tell_here(hint)
-        return await self._plane.rpc.call(gateway, "pool_hint", hint, Hinted, timeout_s=TELL_S)
+        return await self._plane.rpc.call(gateway, keyspace.POOL_HINT, hint, timeout_s=TELL_S)
 
     async def close(self) -> None:
         """Tell nothing more; keep what was measured."""

@@ -58,7 +58,7 @@ from appliance.model import (
     TaskState,
     plan_hash,
 )
-from appliance.tasks.transition import StaleTransitionError, Transition, TransitionKind
+from appliance.model.transitions import StaleTransitionError, Transition, TransitionKind
 
 SHORTEST = 8
 """Characters of a hash that an approval must give at least: a person reads them from a screen."""
@@ -256,7 +256,7 @@ def _with(record: TaskRecord, changed: SubtaskRecord) -> TaskRecord:
 
 
 MOST_PAUSES = 16
-"""Reasons for one pause that are told apart: more stops of one task's robots make it no more paused."""
+"""Reasons for one pause that are listed: more stops of one task's robots make it no more paused."""
 _LIVE = (TaskState.ACCEPTED, TaskState.PROPOSED, TaskState.RUNNING)
 _AGAIN = (SubtaskState.FAILED, SubtaskState.CANCELLED)
 

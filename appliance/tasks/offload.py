@@ -17,12 +17,14 @@ only as long as nobody else has room: under uneven load one gateway's queue grow
 facts of other gateways change, and now and then in any case, those who wait are gone through in their turns:
 
     warm   another gateway has a ready container: the run is passed on to it
-    anew   nobody has, but another gateway has room for a new one and nobody waiting, and the wait here is expected
+    new    nobody has, but another gateway has room for a new one and nobody waiting, and the wait here is expected
            to take longer than such a start: the run is passed on, to be started there
 
 A run is taken out of the queue here before it is offered, so that it cannot begin twice; if it is not taken there it
 goes back to its old place in the queue, and is offered again after a pause that doubles (backoff). `choose` decides,
 without I/O.
+
+Both hand runs over by `handoff.Handoff`.
 
 **Passing on** (`Passing`). The run is in one queue at any time. Taken there, its further events are that gateway's;
 this one tells the coordinator where it is, and passes on questions after it and cancels. When it is not known whether
@@ -35,13 +37,12 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Protocol
 
 import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import DeadlineError, PoolError, SwiftbotError, UnreachableError
+from appliance.errors import PoolError, SwiftbotError
 from appliance.model import (
     Considered,
     ContainerInfo,
@@ -55,29 +56,28 @@ from appliance.model import (
     RunRequest,
     VolumeInfo,
     Way,
+    keyspace,
 )
+from appliance.model.keys import Verb
+from appliance.model.task_api import ContainerList, RunAsk, RunStatus
+from appliance.plane.events import FactsChanged, FleetEvent, Lost, Stage
 from appliance.plane.node import Plane
 from appliance.pool.allocator import WithdrawnError
 from appliance.pool.fair_queue import Turn, turn_of
 from appliance.pool.pool import Pool
-from appliance.pool.selection import MOST_CONSIDERED, Candidate, Decision, Facts
-from appliance.pool.transfer.protocol import Link
-from appliance.tasks.api import ContainerList, RunAsk, RunStatus
+from appliance.pool.selection import MOST_CONSIDERED, UNMEASURED, Candidate, Decision, Facts, Link
+from appliance.tasks.handoff import Handoff, Outcome
 from appliance.tasks.placement import bytes_by_gateway
 from appliance.tasks.records import MAX_NOTE, clean
 
 ASK_TIMEOUT_S = 0.15
 """A neighbour slower than this is no help: a cold start costs about as much."""
-UNKNOWN_ROUND_TRIP_MS = 5.0
-BRING_MS = 40.0
-"""What bringing a volume costs however small it is: asking for it, the snapshot there, the swap here (measured with a
-file of 14 bytes on a loaded machine: 50 to 80 ms to the first line of the handler)."""
 FRESH_S = 10.0
 """What was heard of a gateway within this time is believed without asking: it tells its status every few seconds and
 every change of a container at once, so silence for longer means that something is lost on the way."""
 PROMISED_S = 0.25
 """For how long at most a container to which a run was sent is not counted on any more: by then its gateway has told
-that it is busy (changes are told after 20 ms), or has had a run more."""
+that it is busy (changes are published after 20 ms), or has had a run more."""
 PATIENCE = 2.0
 """Once somebody has offered all that is needed, the others are waited for until so many times as long as that took: a
 slower one is dearer anyhow, and one that does not answer would cost the whole of `ASK_TIMEOUT_S`."""
@@ -92,30 +92,6 @@ FIRST_LEFT_OUT_S = 0.25
 alone with its queue (80 runs/s, uneven: runs refused here while others stand idle)."""
 
 
-class Links(Protocol):
-    """What moving bytes costs: `pool.transfer.Transfers`."""
-
-    def bandwidth_mbps(self, gateway: str) -> float:
-        """Megabits per second with a gateway."""
-        ...
-
-    def cost_ms(self, size_bytes: int, gateway: str) -> float:
-        """Serialise + size / bandwidth + deserialise, milliseconds."""
-        ...
-
-
-class UnmeasuredLinks:
-    """Careful guesses, the same for every gateway, where nothing is moved that could be measured."""
-
-    def bandwidth_mbps(self, gateway: str) -> float:  # noqa: ARG002 - all are guessed alike
-        """Megabits per second."""
-        return Link().bandwidth * 8 / 1e6
-
-    def cost_ms(self, size_bytes: int, gateway: str) -> float:  # noqa: ARG002
-        """Serialise + size / bandwidth + deserialise, milliseconds."""
-        return Link().cost_ms(size_bytes)
-
-
 class _Trust(Struct):
     """How a gateway's offers have turned out."""
 
@@ -124,7 +100,7 @@ class _Trust(Struct):
 
 
 class Sent(Struct):
-    """A run that was sent to a gateway. It holds one of its ready containers until that one is told of anew."""
+    """A run that was sent to a gateway. It holds one of its ready containers until that one is heard of again."""
 
     gateway: str
     until: float
@@ -142,13 +118,13 @@ class RemoteContainers:
     Args:
         plane: the fleet.
         successors: how many neighbours on the ring are asked.
-        links: what is measured of moving bytes to and from other gateways.
+        link: what is measured of moving bytes from a gateway.
     """
 
-    def __init__(self, plane: Plane, *, successors: int, links: Links) -> None:
+    def __init__(self, plane: Plane, *, successors: int, link: Callable[[str], Link] = lambda _: UNMEASURED) -> None:
         self._plane = plane
         self._successors = successors
-        self._links = links
+        self._link = link
         self._round_trip_ms: dict[str, float] = {}
         self._trust: dict[str, _Trust] = {}
         self._sent: dict[str, list[Sent]] = {}
@@ -159,14 +135,18 @@ class RemoteContainers:
         """Gateway -> until when what is known of its containers is not believed: it had none when it was asked."""
         self.searches: Counter[str] = Counter()
         """For GatewayStatus.searches."""
-        plane.on_member_lost.append(self._forget)
+        plane.events.subscribe(Stage.OFFLOAD, self._on_event)
+
+    def _on_event(self, event: FleetEvent) -> None:
+        if isinstance(event, Lost):
+            self._forget(event.gateway)
 
     async def find(self, need: Need, avoid: Collection[str] = ()) -> list[Candidate]:
         """Containers on other gateways that could serve a need, in any state, each with its round trip.
 
         Args:
             need: T = (image, cpu, mem, volumes).
-            avoid: gateways whose containers will not be used: what they have is told, and ends no search.
+            avoid: gateways whose containers will not be used: what they have is returned, and ends no search.
         """
         here = self._plane.gateway
         self._plane.registry.asked(need.image)
@@ -178,7 +158,7 @@ class RemoteContainers:
         self.searches["asked"] += len(asked)
         taken = {(each.gateway, each.id) for each in self._promised_ones(found.values())}
         for gateway, containers in (await self._ask_all(asked, need, avoid)).items():
-            # Whoever answers has counted in what was sent to it: short runs are over before anything was told.
+            # The answer counts in what was sent there: short runs are over before anything was published.
             taken = {key for key in taken if key[0] != gateway}
             # What a gateway says of its own containers is newer than what was heard of them.
             own = {each.id for each in containers if each.gateway == gateway}
@@ -195,7 +175,7 @@ class RemoteContainers:
                     found[key] = each
         members = self._plane.members()
         return [
-            Candidate(container=each, round_trip_ms=self._round_trip_ms.get(each.gateway, UNKNOWN_ROUND_TRIP_MS))
+            Candidate(container=each, round_trip_ms=self._link_to(each.gateway).round_trip_ms)
             for key, each in found.items()
             if each.gateway != here and each.gateway in members and key not in taken
         ]
@@ -260,7 +240,7 @@ class RemoteContainers:
     def promise(self, gateway: str, run: tuple[str, str] = ("", "")) -> Sent:
         """Note that a run is being sent to a gateway: one of its ready containers is spoken for.
 
-        What is returned tells `turned_out` which of the runs that were sent there its answer is about.
+        What is returned tells `outcome` which of the runs that were sent there its answer is about.
         """
         known = self._plane.registry.containers.get(gateway, {})
         runs = {each.id: each.runs for each in known.values() if each.state is ContainerState.READY}
@@ -273,7 +253,7 @@ class RemoteContainers:
         self._runs[run] = sent
         return sent
 
-    def waits_for(self, run: tuple[str, str]) -> bool:
+    def waits_for(self, run: tuple[str, ...]) -> bool:
         """Whether a run was sent elsewhere so lately that its end is worth hearing of; asked on any thread."""
         return run in self._runs
 
@@ -327,9 +307,7 @@ class RemoteContainers:
     async def _ask(self, gateway: str, need: Need) -> tuple[ContainerInfo, ...] | None:
         began = time.monotonic()
         try:
-            answer = await self._plane.rpc.call(
-                gateway, "find_containers", need, ContainerList, timeout_s=ASK_TIMEOUT_S
-            )
+            answer = await self._plane.rpc.call(gateway, keyspace.FIND_CONTAINERS, need, timeout_s=ASK_TIMEOUT_S)
         except SwiftbotError:
             return None
         except asyncio.CancelledError:  # others were quicker: it takes this long at least
@@ -362,7 +340,7 @@ class RemoteContainers:
     def facts(self, need: Need) -> Facts:
         """Where the newest state of the volumes asked for is, and what moving bytes costs."""
         held = {name: holders for name in need.volumes if (holders := self._holders(name))}
-        return Facts(volumes=held, files_ms=self._files_ms, state_ms=self._state_ms)
+        return Facts(volumes=held, links={gateway: self._link_to(gateway) for gateway in self._plane.members()})
 
     def _holders(self, volume: str) -> tuple[VolumeInfo, ...]:
         """Who holds the newest state of a volume, of the gateways that are there."""
@@ -376,13 +354,9 @@ class RemoteContainers:
         newest = max((each.generation for each in known), default=0)
         return tuple(each for each in known if each.generation == newest)
 
-    def _files_ms(self, size: int, gateway: str) -> float:
-        """Bytes at so many megabits per second: 1 Mbit/s is 1000 bits a millisecond."""
-        return size * 8 / (1e3 * self._links.bandwidth_mbps(gateway))
-
-    def _state_ms(self, size: int, gateway: str) -> float:
-        round_trip_ms = self._round_trip_ms.get(gateway, UNKNOWN_ROUND_TRIP_MS)
-        return BRING_MS + round_trip_ms + self._links.cost_ms(size, gateway)
+    def _link_to(self, gateway: str) -> Link:
+        link = self._link(gateway)
+        return replace(link, round_trip_ms=self._round_trip_ms.get(gateway, link.round_trip_ms))
 
     # --- how offers turn out --------------------------------------------------------------------------------------
 
@@ -395,12 +369,30 @@ class RemoteContainers:
             if trust.until > at
         }
 
-    def turned_out(
-        self, sent: Sent, *, good: bool, container: str = "", now: Callable[[], float] = time.monotonic
+    def outcome(
+        self,
+        sent: Sent | None,
+        *,
+        taken: bool | None,
+        container: str = "",
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Note whether a container that a gateway offered was there, and which one the run that was sent there got."""
+        """Note what came of sending a run to a gateway.
+
+        Args:
+            sent: what `promise` returned; None: no ready container was promised.
+            taken: whether the gateway has the run; None: it did not say. That is neither a container that was there
+                nor one that was not: what is thought of the gateway stays, and its promised container is held no longer
+                than any.
+            container: the one that the run got.
+            now: the clock, in seconds.
+        """
+        if taken is None:
+            self.searches["unanswered"] += 1
+        if taken is None or sent is None:
+            return
         gateway = sent.gateway
-        if good:
+        if taken:
             sent.container = container
             self._trust.pop(gateway, None)
             return
@@ -435,7 +427,7 @@ def _is_all(container: ContainerInfo, need: Need) -> bool:
 log = structlog.get_logger(__name__)
 
 LOOK_AT_MOST_EVERY_S = 0.02
-"""Facts come in bursts, and those of one gateway are told together after 20 ms."""
+"""Facts come in bursts, and those of one gateway are published together after 20 ms."""
 LOOK_S = 0.25
 """How often those who wait are gone through when nothing is heard."""
 AT_ONCE = 8
@@ -444,8 +436,8 @@ MOST_OFFERS = 12
 """Times that one run is offered; then it stays."""
 FIRST_PAUSE_S = 0.05
 LONGEST_PAUSE_S = 1.0
-ANEW_S = 0.5
-"""A gateway is sent one run in this time to be started anew: by then its status tells of the container."""
+NEW_S = 0.5
+"""A gateway is sent one run in this time to be started in a new container: by then its status tells of that one."""
 WORTH = 1.5
 """The wait here must be expected to take so many times as long as a start elsewhere: both are estimates."""
 
@@ -454,7 +446,7 @@ class Offer(Struct, frozen=True, kw_only=True):
     """Where a waiting run is to be passed on to, and why."""
 
     gateway: str
-    anew: bool
+    new_container: bool
     why: str
 
 
@@ -474,7 +466,7 @@ def choose(
     Args:
         avoid: gateways where it must not go: the one where it waits, and those where an attempt at it failed.
         ready: containers of others that are ready for it.
-        gateways: other gateways that are there, with no run just sent to them to be started anew.
+        gateways: other gateways that are there, with no run just sent to them to be started in a new container.
         need: what it asks of a container.
         within: gateways it may go to; empty: any.
         waited_s: how long it has waited.
@@ -495,7 +487,7 @@ def choose(
             return (not exact, status.load if status else 1.0, container.gateway, container.id)
 
         best = min(allowed, key=load)
-        return Offer(gateway=best.gateway, anew=False, why=f"{best.gateway} has a ready container")
+        return Offer(gateway=best.gateway, new_container=False, why=f"{best.gateway} has a ready container")
     # What has waited long already will wait long yet, whatever was expected.
     if max(expected_s or 0.0, waited_s) < WORTH * cold_s:
         return None
@@ -514,7 +506,7 @@ def choose(
     if not roomy:
         return None
     best = min(roomy, key=lambda status: (status.load, status.id))
-    return Offer(gateway=best.id, anew=True, why=f"{best.id} has room for a new container")
+    return Offer(gateway=best.id, new_container=True, why=f"{best.id} has room for a new container")
 
 
 class _Tries(Struct):
@@ -544,17 +536,17 @@ class Elsewhere:
         self._wake = asyncio.Event()
         self._tries: dict[str, _Tries] = {}
         self._offers: dict[str, Offer] = {}
-        """Where the runs that were withdrawn are to go; taken from here by whoever passes them on."""
+        """Where the runs that were withdrawn are to go; `QueuedOffer` takes them from here."""
         self._promised: dict[str, Sent] = {}
         """The same runs, where a container that was ready was promised."""
         self._under_way: set[str] = set()
-        self._anew: dict[str, float] = {}
-        """Gateway -> until when it is not sent another run to be started anew."""
+        self._starting: dict[str, float] = {}
+        """Gateway -> until when it is not sent another run to be started in a new container."""
         self._looking: asyncio.Task[None] | None = None
 
     def start(self) -> None:
         """Begin to look."""
-        self._plane.registry.on_change.append(self._on_fact)
+        self._plane.events.subscribe(Stage.OFFLOAD, self._on_event)
         self._looking = asyncio.create_task(self._keep_looking(), name="look elsewhere for waiting runs")
 
     def stop(self) -> None:
@@ -566,8 +558,8 @@ class Elsewhere:
         """Go through those who wait soon: a run may have begun to."""
         self._wake.set()
 
-    def _on_fact(self, kind: str) -> None:
-        if kind in ("container", "gateway"):
+    def _on_event(self, event: FleetEvent) -> None:
+        if isinstance(event, FactsChanged) and event.kind in ("container", "gateway"):
             self._wake.set()
 
     async def _keep_looking(self) -> None:
@@ -589,7 +581,7 @@ class Elsewhere:
         waiting = self._pool.waiting()
         ids = {turn.id for turn, _ in waiting} | self._under_way
         self._tries = {run_id: tries for run_id, tries in self._tries.items() if run_id in ids}
-        self._anew = {gateway: until for gateway, until in self._anew.items() if until > now}
+        self._starting = {gateway: until for gateway, until in self._starting.items() if until > now}
         for position, (turn, need) in enumerate(waiting, start=1):
             if len(self._under_way) >= AT_ONCE:
                 return
@@ -609,7 +601,7 @@ class Elsewhere:
             gateways={
                 name: status
                 for name, status in self._plane.registry.gateways.items()
-                if name in members and name not in self._anew
+                if name in members and name not in self._starting
             },
             need=need,
             within=request.group,
@@ -625,15 +617,15 @@ class Elsewhere:
             return
         tries.count += 1
         self._under_way.add(run_id)
-        if offer.anew:
-            self._anew[offer.gateway] = now + ANEW_S
+        if offer.new_container:
+            self._starting[offer.gateway] = now + NEW_S
         else:
             task, subtask, _ = run_id.split("/")
             self._promised[run_id] = self._remote.promise(offer.gateway, (task, subtask))
 
-    def offer_of(self, run_id: str) -> Offer:
+    def offer_of(self, run_id: str) -> "QueuedOffer":
         """Where a run that was withdrawn is to go."""
-        return self._offers[run_id]
+        return QueuedOffer(self, run_id, self._offers[run_id])
 
     def forget(self, run_id: str) -> None:
         """Note that a run is not in progress here any more: it may have ended at the moment it was withdrawn."""
@@ -646,31 +638,39 @@ class Elsewhere:
 
         Args:
             run_id: what was offered.
-            taken: whether the other gateway has it; None: it did not say. That is neither a container that was there
-                nor one that was not: what is thought of the gateway stays, and its promised container is held no longer
-                than any.
+            taken: whether the other gateway has it; None: it did not say.
             container: the one that it got there.
         """
         del self._offers[run_id]
         self._under_way.discard(run_id)
-        sent = self._promised.pop(run_id, None)
-        if taken is None:
+        self._remote.outcome(self._promised.pop(run_id, None), taken=taken, container=container)
+        if taken is not False:
             self._tries.pop(run_id, None)
-            self._remote.searches["unanswered"] += 1
-            return
-        if sent is not None:
-            self._remote.turned_out(sent, good=taken, container=container)
-        if taken:
-            self._tries.pop(run_id, None)
-            self._remote.searches["moved"] += 1
+            self._remote.searches["moved"] += taken is True
             return
         tries = self._tries.setdefault(run_id, _Tries(count=1))
         pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2 ** (tries.count - 1))
         tries.not_before = time.monotonic() + pause_s
 
 
-ORDER_S = 2.0
-"""How long another gateway may take to accept a run."""
+class QueuedOffer:
+    """Offers for a run that was taken out of the queue here: the one gateway that `choose` found."""
+
+    def __init__(self, elsewhere: Elsewhere, run_id: str, offer: Offer) -> None:
+        self.offer = offer
+        self._elsewhere = elsewhere
+        self._run_id = run_id
+        self._left = [offer.gateway]
+
+    async def best(self) -> str:
+        """Return it, once."""
+        return self._left.pop() if self._left else ""
+
+    def note(self, outcome: Outcome) -> None:
+        """Note whether it has the run."""
+        self._elsewhere.offered(self._run_id, taken=outcome.taken, container=outcome.container)
+
+
 PASSED_ON_S = 1.0
 """How long the gateway that a run was passed on to may take to answer a question after it."""
 
@@ -750,41 +750,32 @@ class Passing:
             check(request)
             decision = replace(decision, container=None, reservation="")
 
-    async def _pass_on(self, request: RunRequest, offer: Offer, since: float) -> PassedOn | None:
-        run_id, container = request.run_id, ""
-        taken: bool | None = None
-        order = replace(request, hops=1, anew=offer.anew)
-        try:
-            accepted = await self._plane.rpc.call(offer.gateway, "run", order, RunAccepted, timeout_s=ORDER_S)
-            taken, container = True, accepted.container
-        except SwiftbotError as error:
-            if may_run(error):
-                raise UnreachableError(f"{offer.gateway} did not say whether it runs {run_id}") from error
-            taken = False
-            self._plane.session.refuse("stale offer", key=offer.gateway, run=run_id, reason=error.message)
+    async def _pass_on(self, request: RunRequest, offers: QueuedOffer, since: float) -> PassedOn | None:
+        offer = offers.offer
+        order = replace(request, hops=1, new_container=offer.new_container)
+        accepted = await Handoff(self._plane, order).begin(offers)
+        if accepted is None:
             return None
-        finally:
-            self._elsewhere.offered(run_id, taken=taken, container=container)
-        self.moved[run_id] = accepted.gateway
+        self.moved[request.run_id] = accepted.gateway
         why = f"waited {time.monotonic() - since:.1f} s on {self._plane.gateway}, then {offer.why}"
         choice = accepted.choice and replace(
-            accepted.choice, by=self._plane.gateway, way=Way.NEW if offer.anew else Way.RUN_THERE, why=why
+            accepted.choice, by=self._plane.gateway, way=Way.NEW if offer.new_container else Way.RUN_THERE, why=why
         )
         return PassedOn(replace(whereabouts(request, accepted), note=clean(why, MAX_NOTE), choice=choice))
 
-    async def ask(self, run_id: str, verb: str) -> RunStatus:
+    async def ask(self, run_id: str, verb: Verb[RunAsk, RunStatus]) -> RunStatus:
         """Ask after a run that was passed on (`run_status`), or have it ended (`run_cancel`), where it is."""
         task, subtask, number = run_id.split("/")
         ask, there = RunAsk(task=task, subtask=subtask, attempt=int(number)), self.moved[run_id]
         try:
-            return await self._plane.rpc.call(there, verb, ask, RunStatus, timeout_s=PASSED_ON_S)
+            return await self._plane.rpc.call(there, verb, ask, timeout_s=PASSED_ON_S)
         except SwiftbotError as error:
             log.info("no word of a run that was passed on", run=run_id, gateway=there, reason=str(error))
             return RunStatus(running=self._plane.sees(there))
 
 
 def whereabouts(request: RunRequest, accepted: RunAccepted) -> RunEvent:
-    """What is told of a run that was accepted: where it is."""
+    """Return the event of a run that was accepted: where it is."""
     return RunEvent(
         task=request.task,
         subtask=request.subtask,
@@ -793,15 +784,6 @@ def whereabouts(request: RunRequest, accepted: RunAccepted) -> RunEvent:
         gateway=accepted.gateway,
         phase=accepted.phase,
     )
-
-
-def may_run(error: SwiftbotError) -> bool:
-    """Whether an order to run that ended so may have been taken: it had no answer, but may have arrived.
-
-    The same attempt must not be begun in a second place then, for nothing fences the two off from each other. Only the
-    next attempt is safe, which ends this one wherever it is.
-    """
-    return isinstance(error, DeadlineError) or (isinstance(error, UnreachableError) and error.sent)
 
 
 def explained(decision: Decision, avoid: Mapping[str, str]) -> Decision:
@@ -847,49 +829,75 @@ class Choosing:
         self._check = check
 
     async def choose(self, request: RunRequest) -> Decision | RunAccepted:
-        """Select a container; what another gateway answered, where that has taken the run.
-
-        An offer that turns out to be nothing is counted, explained in the choice, and the next best is taken; the
-        last try is without other gateways.
-        """
-        remote, inputs = self._remote, bytes_by_gateway(request.inputs)
+        """Select a container; what another gateway answered, where that has taken the run."""
         avoid = {
-            **remote.left_out(),
+            **self._remote.left_out(),
             **self._outside(request),
             **dict.fromkeys(request.avoid, "an earlier attempt failed there"),
         }
-        for left in reversed(range(REMOTE_TRIES + 1)):
-            decision = await self._pool.select(
-                request.need,
-                allow_remote=request.hops == 0 and left > 0,
-                inputs=inputs,
-                avoid=avoid,
-                turn=turn_of(request),
-            )
-            if decision.phase is not Phase.REMOTE_WARM:
-                return explained(decision, avoid)
-            self._check(request)
-            gateway = decision.gateway
-            sent = remote.promise(gateway, (request.task, request.subtask))
-            try:
-                accepted = await self._plane.rpc.call(
-                    gateway, "run", replace(request, hops=1), RunAccepted, timeout_s=ORDER_S
-                )
-            except SwiftbotError as error:
-                if may_run(error):
-                    remote.searches["unanswered"] += 1
-                    raise UnreachableError(f"{gateway} did not say whether it runs {request.run_id}") from error
-                # The container was taken, or was never there, or its gateway went away meanwhile.
-                remote.turned_out(sent, good=False)
-                avoid = {**avoid, gateway: f"had none when asked: {clean(error.message, MAX_VERDICT)}"}
-                self._plane.session.refuse("stale offer", key=gateway, run=request.run_id, reason=error.message)
-            else:
-                remote.turned_out(sent, good=True, container=accepted.container)
-                return passed_on(accepted, explained(decision, avoid))
-        raise PoolError("a selection without other gateways chose one")
+        selection = Selection(self._pool, self._remote, request, avoid, check=self._check)
+        accepted = await Handoff(self._plane, replace(request, hops=1)).begin(selection)
+        decision = explained(selection.decision, selection.avoid)
+        return decision if accepted is None else passed_on(accepted, decision)
 
     def _outside(self, request: RunRequest) -> dict[str, str]:
         """Gateways that the run may not be passed on to."""
         if not request.group:
             return {}
         return {each: "the submitter does not allow it" for each in self._plane.members() if each not in request.group}
+
+
+class Selection:
+    """Offers for a run that has just come: what selection chooses, as long as that is on another gateway.
+
+    An offer that turns out to be nothing is counted, explained in the choice, and the next best is taken; the last try
+    is without other gateways.
+    """
+
+    decision: Decision
+    """What was selected last."""
+
+    def __init__(
+        self,
+        pool: Pool,
+        remote: RemoteContainers,
+        request: RunRequest,
+        avoid: dict[str, str],
+        *,
+        check: Callable[[RunRequest], None],
+    ) -> None:
+        self.avoid = avoid
+        """Gateways whose containers are not used, with the reason."""
+        self._pool = pool
+        self._remote = remote
+        self._request = request
+        self._check = check
+        self._inputs = bytes_by_gateway(request.inputs)
+        self._left = REMOTE_TRIES
+        self._sent: Sent | None = None
+
+    async def best(self) -> str:
+        """Select; empty when the container, or room for one, is here."""
+        request = self._request
+        self.decision = await self._pool.select(
+            request.need,
+            allow_remote=self._left > 0,
+            inputs=self._inputs,
+            avoid=self.avoid,
+            turn=turn_of(request),
+        )
+        if self.decision.phase is not Phase.REMOTE_WARM:
+            return ""
+        if not self._left:
+            raise PoolError("a selection without other gateways chose one")
+        self._left -= 1
+        self._check(request)
+        self._sent = self._remote.promise(self.decision.gateway, (request.task, request.subtask))
+        return self.decision.gateway
+
+    def note(self, outcome: Outcome) -> None:
+        """Leave a gateway out of the next selection that did not have what it was chosen for."""
+        self._remote.outcome(self._sent, taken=outcome.taken, container=outcome.container)
+        if outcome.taken is False:
+            reason = f"had none when asked: {clean(outcome.reason, MAX_VERDICT)}"
+            self.avoid = {**self.avoid, self.decision.gateway: reason}

@@ -11,7 +11,7 @@ whatever it can serve itself: it coordinates.
 
     score(member) = w_l * (1 - load) + w_d * proximity + w_w * warm
 
-A group is formed once and then kept. It is formed anew when a member can serve nothing any more, when the root has
+A group is formed once and then kept. It is formed again when a member can serve nothing any more, when the root has
 changed, or when nobody in it can serve a subtask that somebody else can; what can be kept is kept. Now and then it is
 looked at as a whole: it takes in others while it has room, and exchanges a member for another gateway that is better by
 more than `HYSTERESIS`, so that gateways whose loads go up and down together do not take turns in it.
@@ -27,14 +27,14 @@ that is draining, cannot start containers and has none ready, or failed this sub
 no candidate. Ties go to the gateway that asks: it is a network hop nearer.
 
 **Queue** (`Line`): the ready subtasks that one gateway coordinates and that wait for room, in their turns. Without it
-every task would push its subtasks at gateways as soon as they are ready: whoever asks most often gets most, priorities
-count only where a queue happens to be, and what a full gateway refuses uses up attempts. Here a subtask is sent only
-when a gateway that can serve it has room, and when several could be, `pool.turns` says whose turn it is. Room is what a
-gateway may hold, containers and some who wait for one (so that none stands idle until its coordinator hears of it),
-less what runs there: by its own word, or by what was sent there and has not ended, whichever is more.
+every task would push its subtasks at gateways as soon as they are ready: the one that asks most often gets most,
+priorities count only where a queue happens to be, and what a full gateway refuses uses up attempts. Here a subtask is
+sent only when a gateway that can serve it has room, and when several could be, `pool.turns` says whose turn it is. Room
+is what a gateway may hold, containers and some who wait for one (so that none stands idle until its coordinator hears
+of it), less what runs there: by its own word, or by what was sent there and has not ended, whichever is more.
 
 **Decision trace** (`PlacementCase`): all that a placement rested on, put for the log, so that it can be made again.
-Only of subtasks that were sent: one that waits is placed anew several times a second. Gateways that were no candidates
+Only of subtasks that were sent: one that waits is placed several times a second. Gateways that were no candidates
 are left out, since they have no part in the order; so are containers that were not ready.
 """
 
@@ -59,6 +59,7 @@ from appliance.model import (
     SubtaskState,
     TaskRecord,
     encode,
+    keyspace,
 )
 from appliance.plane.node import Plane
 from appliance.pool.fair_queue import Completions, Turn, Turns
@@ -172,7 +173,7 @@ def root_of(members: Collection[str], order: Sequence[str]) -> str:
 
 
 def must_form(group: Group | None, standings: Mapping[str, Standing], *, root: str, ready: Iterable[str]) -> str:
-    """Return why a group must be formed (anew) at once, in words; empty when it may stay as it is.
+    """Return why a group must be formed at once, in words; empty when it may stay as it is.
 
     Args:
         group: the present one; None: there is none yet.
@@ -707,7 +708,7 @@ class Line:
 
 
 MOST_GATEWAYS = 64
-"""Candidates that are told of one placement; a group has eight."""
+"""Candidates that are kept of one placement; a group has eight."""
 
 
 class Seen(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -798,7 +799,7 @@ def _ready(containers: Iterable[ContainerInfo]) -> tuple[tuple[str, ...], ...]:
 def tell(plane: Plane, case: PlacementCase | None) -> None:
     """Put a placement, for the log."""
     if case is not None:
-        plane.session.put(plane.keys.decided(plane.gateway, "placement"), encode(case))
+        plane.session.put(plane.keys(keyspace.DECIDED, plane.gateway, "placement"), encode(case))
 
 
 def place_again(case: PlacementCase) -> dict[str, Any]:

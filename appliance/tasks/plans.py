@@ -1,143 +1,31 @@
-"""Plans of the tasks that one gateway drives: made by the decomposer, checked, approved by a person, and revised.
+"""Plans of the tasks that one gateway drives: made by the decomposer, checked, approved by a person, and revised."""
 
-`Plans` makes and checks plans by what is known of robots, skills and site just now, and says whether a person has to
-agree first. `Recovery` has what coordinators need to find runs that go wrong and to revise plans: facts, counters, and
-the way to the decomposer.
-"""
+from collections.abc import Awaitable, Callable, Collection
 
-from collections import Counter
-from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
-
-import structlog
 from msgspec.structs import replace
 
 from appliance.errors import PlanError
 from appliance.llm.cascade import Decomposer
+from appliance.llm.checks.safety import out_of_use
 from appliance.llm.checks.schema import validate
-from appliance.llm.settings import PlanContext
-from appliance.model import Plan, Site, SubtaskRecord, SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.llm.settings import OutOfUse, PlanContext
+from appliance.model import Plan, Site, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.model.task_api import (
+    ExperienceAsk,
+    ExperienceList,
+    PlanAnswer,
+    PlanAsk,
+    PlanCheckAsk,
+    PlanChecked,
+    TaskAsk,
+)
 from appliance.plane.node import Plane
-from appliance.skills.catalogue import Catalogue, SkillManifest
+from appliance.skills.catalogue import Catalogue
 from appliance.tasks.admission import checked
-from appliance.tasks.api import ExperienceAsk, ExperienceList, PlanAnswer, PlanAsk, PlanCheckAsk, PlanChecked, TaskAsk
-from appliance.tasks.durations import Durations
 from appliance.tasks.machine import ACTIVE, plan_hash
 from appliance.tasks.replan import Robots, problems, remainder, splice
-from appliance.tasks.replan import problems as unspliced
 from appliance.tasks.settings import TasksConfig
 from appliance.tasks.steering import needs_approval
-from appliance.tasks.transition import Transition
-
-log = structlog.get_logger(__name__)
-
-
-class Recovery:
-    """One per gateway, shared by its drivers.
-
-    Args:
-        plane: the fleet.
-        catalogue: the skills known here.
-        decomposer: who plans anew.
-        site: the map plans are checked against.
-        durations: how long runs took.
-        busy: robots with a run in progress.
-    """
-
-    def __init__(
-        self,
-        plane: Plane,
-        *,
-        catalogue: Catalogue,
-        decomposer: Decomposer,
-        site: Site,
-        durations: Durations,
-        busy: Callable[[], Collection[str]],
-    ) -> None:
-        self._plane = plane
-        self._catalogue = catalogue
-        self._decomposer = decomposer
-        self._site = site
-        self._durations = durations
-        self._busy = busy
-        self.counts: Counter[str] = Counter()
-        """What was found and done, by kind, since start."""
-        self.on_published: Callable[[Transition], None] = lambda _: None
-        """Hears of each transition that is published here."""
-
-    @property
-    def manifests(self) -> Mapping[str, SkillManifest]:
-        """Manifests by skill, of those known here."""
-        return self._catalogue.skills
-
-    def robots(self) -> Robots:
-        """The roster as it is known now."""
-        experience = self._decomposer.memory.experience
-        return Robots(roster=self._plane.registry.robots, busy=self._busy(), shuns=experience.shuns)
-
-    def experience(self, skill: str) -> Sequence[float]:
-        """How long the last runs of a skill took, seconds."""
-        return self._durations.seen(skill)
-
-    def published(self, transition: Transition) -> None:
-        """Hear of a transition that was published."""
-        self.on_published(transition)
-
-    def note(self, what: str, record: TaskRecord, target: SubtaskRecord, why: str) -> None:
-        """Count what was found or done, and say it in the log."""
-        self.counts[what] += 1
-        log.info(
-            f"monitor: {what}",
-            task=record.id,
-            subtask=target.subtask.id,
-            attempt=target.attempt,
-            skill=target.subtask.skill,
-            why=why,
-        )
-
-    async def replan(self, record: TaskRecord) -> Plan:
-        """Have the decomposer plan anew what is left of a task.
-
-        Raises:
-            PlanError: it cannot; the message says why.
-        """
-        context = self._context(record)
-        manifests = self._catalogue.skills
-        outcome = await self._decomposer.replan(
-            record,
-            context,
-            problems=lambda plan: problems(record, plan, manifests),
-            rest=lambda plan: rest_of(record, plan),
-        )
-        return outcome.plan
-
-    def against(self, record: TaskRecord, target: SubtaskRecord, plan: Plan, robot: str = "") -> tuple[str, ...]:
-        """Say what a revised plan makes wrong that was not wrong before, by the checks that every plan has to pass.
-
-        Args:
-            record: the task as it stands.
-            target: the subtask that was given up.
-            plan: the task's plan from then on.
-            robot: who takes over from the robot of `target`; "" when nobody does.
-        """
-        context = self._context(record)
-        wrong = self._decomposer.review(remainder(record, target, plan, robot), context).problems
-        if not wrong:
-            return ()
-        # A robot that has left meanwhile, say, is no reason against what is done about another's failure.
-        before = remainder(record, target, record.plan, "") if record.plan is not None else plan
-        known = frozenset(self._decomposer.review(before, context).problems)
-        return tuple(each for each in wrong if each not in known)
-
-    def _context(self, record: TaskRecord) -> PlanContext:
-        """What is known now that bears on a task, and whose it is: a robot's task stays a robot's."""
-        roster = self._plane.registry.robots
-        return PlanContext(
-            instruction=record.instruction,
-            robots=tuple(sorted(roster.values(), key=lambda robot: robot.id)),
-            site=self._site,
-            submitter=record.submitter,
-            from_robot=record.submitter in roster,
-        )
 
 
 def rest_of(record: TaskRecord, proposed: Plan) -> Plan:
@@ -160,7 +48,18 @@ def rest_of(record: TaskRecord, proposed: Plan) -> Plan:
 
 
 class Plans:
-    """Makes and checks plans by what is known of robots, skills and site just now; `task` finds a task's record."""
+    """Makes, checks and revises plans by what is known of robots, skills and site just now.
+
+    Args:
+        config: whether plans have to be approved.
+        plane: the fleet.
+        catalogue: the skills known here.
+        decomposer: makes and reviews plans.
+        site: the map plans are checked against.
+        task: finds a task's record.
+        busy: robots with a run in progress.
+        out_of_use: places that are closed and robots in maintenance.
+    """
 
     def __init__(
         self,
@@ -171,6 +70,8 @@ class Plans:
         decomposer: Decomposer,
         site: Site,
         task: Callable[[TaskAsk], Awaitable[TaskRecord]],
+        busy: Callable[[], Collection[str]],
+        out_of_use: Callable[[], OutOfUse] = OutOfUse,
     ) -> None:
         self._config = config
         self._plane = plane
@@ -178,6 +79,18 @@ class Plans:
         self._decomposer = decomposer
         self._site = site
         self._task = task
+        self._busy = busy
+        self._out_of_use = out_of_use
+
+    def closed(self, subtask: Subtask) -> str:
+        """Why a subtask may not begin just now: where it goes is closed; empty when it may."""
+        context = PlanContext(instruction="", site=self._site, out_of_use=OutOfUse(places=self._out_of_use().places))
+        return "; ".join(out_of_use(subtask, context, self._catalogue))
+
+    def robots(self) -> Robots:
+        """The roster as it is known now."""
+        experience = self._decomposer.memory.experience
+        return Robots(roster=self._plane.registry.robots, busy=self._busy(), shuns=experience.shuns)
 
     async def plan(self, record: TaskRecord) -> Plan:
         """Return the plan handed in with the task if it is valid, else a new one."""
@@ -188,6 +101,40 @@ class Plans:
                 raise PlanError("the plan handed in is not valid", remedy=remedy, problems=problems)
             return record.plan
         return (await self._decomposer.plan(context)).plan
+
+    async def replan(self, record: TaskRecord) -> Plan:
+        """Have the decomposer replan what is left of a task.
+
+        Raises:
+            PlanError: it cannot; the message says why.
+        """
+        context = self._context(record.instruction, submitter=record.submitter)
+        manifests = self._catalogue.skills
+        outcome = await self._decomposer.replan(
+            record,
+            context,
+            problems=lambda plan: problems(record, plan, manifests),
+            rest=lambda plan: rest_of(record, plan),
+        )
+        return outcome.plan
+
+    def against(self, record: TaskRecord, target: SubtaskRecord, plan: Plan, robot: str = "") -> tuple[str, ...]:
+        """Say what a revised plan makes wrong that was not wrong before, by the checks that every plan has to pass.
+
+        Args:
+            record: the task as it stands.
+            target: the subtask that was given up.
+            plan: the task's plan from then on.
+            robot: who takes over from the robot of `target`; "" when nobody does.
+        """
+        context = self._context(record.instruction, submitter=record.submitter)
+        wrong = self._decomposer.review(remainder(record, target, plan, robot), context).problems
+        if not wrong:
+            return ()
+        # A robot that has left meanwhile, say, is no reason against what is done about another's failure.
+        before = remainder(record, target, record.plan, "") if record.plan is not None else plan
+        known = frozenset(self._decomposer.review(before, context).problems)
+        return tuple(each for each in wrong if each not in known)
 
     def approval(self, record: TaskRecord, plan: Plan) -> str:
         """Why a plan has to be approved before it takes effect; "" when it need not be."""
@@ -209,7 +156,7 @@ class Plans:
     def problems(self, record: TaskRecord | None, plan: Plan) -> tuple[str, ...]:
         """What is wrong with a plan just now; of a task that runs, with the continuation that it is."""
         if record is not None and record.state is TaskState.RUNNING:
-            wrong = validate(plan, self._catalogue) or unspliced(record, plan, self._catalogue.skills)
+            wrong = validate(plan, self._catalogue) or problems(record, plan, self._catalogue.skills)
             if wrong:
                 return tuple(wrong)
             try:
@@ -246,6 +193,7 @@ class Plans:
             private=private,
             submitter=submitter,
             from_robot=submitter in roster,
+            out_of_use=self._out_of_use(),
         )
 
     async def experience(self, ask: ExperienceAsk) -> ExperienceList:

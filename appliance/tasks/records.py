@@ -11,9 +11,15 @@ One that can never end (a cycle), or is beyond all bounds, is ended with the rea
 older version than the one that wrote the record before it; fields that only the newer version knows are kept as they
 were, in the record and in anything in it.
 
+**Tombstones.** Of a finished task little is kept after a while (`retention`): enough to answer for its id. `trimmed`
+makes such a record.
+
 Pure.
 """
 
+import hashlib
+from collections.abc import Collection
+from datetime import UTC, datetime
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from typing import Any, NamedTuple, cast
@@ -22,10 +28,23 @@ import msgspec
 from msgspec import Struct, field, inspect
 from msgspec.structs import replace
 
-from appliance.errors import PayloadError
+from appliance.errors import PayloadError, RefusedError
 from appliance.llm.checks.schema import MAX_SUBTASKS
-from appliance.model import Failure, RunEvent, RunEventKind, Split, TaskRecord, encode
+from appliance.model import (
+    Failure,
+    Plan,
+    Remembered,
+    RunEvent,
+    RunEventKind,
+    Split,
+    TaskRecord,
+    TaskRequest,
+    encode,
+    keyspace,
+)
 
+PREFIX = keyspace.TASK_RECORD.prefix
+"""Of the keys of task records in the DHT."""
 MAX_DEPTH = 64
 """Nesting of parameters and results: far beyond any use, far below what JSON decoders refuse (about 1,000)."""
 MAX_NOTE = 500
@@ -33,6 +52,11 @@ MAX_TEXT = 2000
 MAX_CODE = 40
 MAX_RUN_S = 86_400.0
 """Longest that a plan may ask of a run beyond its skill's own time."""
+
+
+def task_key(task: str) -> str:
+    """Key of a task's record in the DHT."""
+    return f"{PREFIX}{task}"
 
 
 def too_deep(value: object, *, limit: int = MAX_DEPTH) -> bool:
@@ -97,9 +121,19 @@ def tidy(event: RunEvent, *, max_result_bytes: int) -> RunEvent:
     )
 
 
+_LONG_WORD = 40
+"""Characters; a longer word is cut."""
+
+
 def clean(text: str, limit: int) -> str:
-    """Return text without lone surrogates, which no JSON can carry, and at most `limit` characters."""
-    return text[:limit].encode(errors="replace").decode()
+    """Return text without lone surrogates, which no JSON can carry, and at most `limit` characters.
+
+    What is cut ends in an ellipsis, between words where there are any.
+    """
+    if len(text) > limit:
+        whole, blank, _ = text[:limit].rpartition(" ")
+        text = f"{(whole if blank and len(whole) > limit - _LONG_WORD else text[: limit - 1]).rstrip()}…"
+    return text.encode(errors="replace").decode()
 
 
 def read_record(value: bytes) -> TaskRecord:
@@ -118,7 +152,7 @@ def unsound(record: TaskRecord) -> Failure | None:
     """Return why a record cannot be driven to an end; None when it can."""
     if reason := _reason(record):
         message = f"the task's record is unsound: {reason}"
-        return Failure(code="payload", message=message, remedy="hand the task in anew")
+        return Failure(code="payload", message=message, remedy="submit the task again")
     return None
 
 
@@ -259,3 +293,78 @@ def _unfenced(record: TaskRecord, split: Split) -> bool:
     """Whether an attempt of a version that lost has a number that the next attempt of this version may be given."""
     made = {run.subtask: run.attempt for run in sorted(split.runs, key=lambda run: run.attempt)}
     return any(made.get(each.subtask.id, 0) >= each.next_attempt and not each.state.final for each in record.subtasks)
+
+
+# --- tombstones ---------------------------------------------------------------------------------------------------
+
+MAX_INSTRUCTION = 80
+"""Characters of the instruction that stay, to recognise the task by."""
+
+
+def may_trim(record: TaskRecord) -> bool:
+    """Whether nothing is left to be done about a record: it has ended, and what a partition left of it is settled."""
+    return record.state.final and not unsettled(record)
+
+
+def trimmed(record: TaskRecord, log: str) -> TaskRecord:
+    """Return the tombstone of a finished task; `log`: names of the log files of its time, empty where none is known.
+
+    The same from whichever gateway makes it, but for the log's name: copies that meet are resolved like any records.
+    """
+    failure = record.failure
+    return TaskRecord(
+        id=record.id,
+        instruction=clean(record.instruction, MAX_INSTRUCTION),
+        submitter=record.submitter,
+        priority=record.priority,
+        state=record.state,
+        failure=None if failure is None else replace(failure, message=clean(failure.message, MAX_NOTE)),
+        cancelled_by=record.cancelled_by,
+        coordinator=record.coordinator,
+        created_ns=record.created_ns,
+        updated_ns=record.updated_ns,
+        sequence=record.sequence,
+        remembered=Remembered(log=log, request=_digest_of(record)),
+    )
+
+
+def digest(instruction: str, group: Collection[str], plan: Plan | None) -> str:
+    """Return 16 hexadecimal digits by which a request is recognised: its text, gateways, and the plan it brought."""
+    steps = [(each.id, each.skill, each.params) for each in plan.subtasks] if plan is not None else None
+    return hashlib.sha256(encode([instruction, sorted(group), steps])).hexdigest()[:16]
+
+
+def _digest_of(record: TaskRecord) -> str:
+    """The digest of the request a record was made for; empty where its plan is another one by now."""
+    edited = record.revised > 0 or (record.decision is not None and record.decision.edited)
+    if record.handed_in and edited:
+        return ""
+    return digest(record.instruction, record.within, record.plan if record.handed_in else None)
+
+
+def answered(record: TaskRecord, request: TaskRequest) -> TaskRecord:
+    """Return what a request is answered whose id is known; a note says where that was of another request."""
+    if record.remembered is None or not record.remembered.request:
+        return record
+    if record.remembered.request == digest(request.instruction, request.group, request.plan):
+        return record
+    note = (
+        f"nothing was begun: task {record.id} was another request ({record.instruction!r}); hand this one in under an "
+        "id of its own"
+    )
+    return replace(record, note=clean(note, MAX_NOTE))
+
+
+def refuse_trimmed(record: TaskRecord) -> None:
+    """Raise RefusedError for a task of which only the outcome is known: there is nothing to try again."""
+    if record.remembered is not None:
+        raise RefusedError(f"task {record.id}: {done_text(record)}; its plan is not kept", remedy="submit it again")
+
+
+def done_text(record: TaskRecord) -> str:
+    """When a trimmed task was done, what came of it, and where its details are; empty for any other."""
+    if record.remembered is None:
+        return ""
+    at = datetime.fromtimestamp(record.updated_ns / 1e9, tz=UTC)
+    where = f"the log {record.remembered.log}" if record.remembered.log else "the logs of that day, if any were kept"
+    return f"done on {at:%Y-%m-%d %H:%M:%S} UTC ({record.state}), details are in {where}"

@@ -51,7 +51,7 @@ def in_order(subtasks: Iterable[Subtask]) -> tuple[Subtask, ...]:
     while waiting:
         free = [each for each in waiting if done.issuperset(known.intersection(each.after))]
         if not free:
-            return (*ordered, *waiting)  # a cycle: whoever checks the plan will say so
+            return (*ordered, *waiting)  # a cycle: the plan's review will say so
         ordered.extend(free)
         done.update(each.id for each in free)
         waiting = [each for each in waiting if each.id not in done]
@@ -248,10 +248,10 @@ def _roots(record: TaskRecord, rest: list[SubtaskRecord]) -> list[SubtaskRecord]
 def _to_repeat(
     done: list[SubtaskRecord], roots: list[SubtaskRecord], manifests: Mapping[str, SkillManifest]
 ) -> list[SubtaskRecord]:
-    """Finished subtasks whose state the rest builds on, in order; without those that it does anew at its beginning."""
+    """Finished subtasks whose state the rest builds on, in order; without those that it does again at its beginning."""
     known = [manifests.get(each.subtask.skill) for each in roots]
-    anew = [frozenset(each.prepares) if each is not None else frozenset[str]() for each in known]
-    names = {name for word, name in left(done, manifests).prepared.items() if not all(word in each for each in anew)}
+    again = [frozenset(each.prepares) if each is not None else frozenset[str]() for each in known]
+    names = {name for word, name in left(done, manifests).prepared.items() if not all(word in each for each in again)}
     return [each for each in done if each.subtask.id in names]
 
 
@@ -581,7 +581,7 @@ def allowed_robot(
 
 
 class AskDecomposer(Struct, frozen=True, kw_only=True):
-    """Nothing simpler helps: the decomposer is to plan anew what is left."""
+    """Nothing simpler helps: the decomposer is to replan what is left."""
 
     note: str
 
@@ -652,11 +652,11 @@ def decide(
         substitution = f"{substitution.subtask.skill} may not take its place: {'; '.join(wrong[:3])}"
     reasons.append(substitution)
     if record.handed_in and not confirmed(record):
-        reasons.append("its plan was handed in with the task and is not planned anew")
+        reasons.append("its plan was handed in with the task and is not replanned")
     elif not config.decompose:
         reasons.append("tasks.replan.decompose is off")
     elif record.replans >= config.max_replans:
-        reasons.append(f"it was planned anew {record.replans} times already (tasks.replan.max_replans)")
+        reasons.append(f"it was replanned {record.replans} times already (tasks.replan.max_replans)")
     else:
         return AskDecomposer(note="; ".join(reasons))
     return GiveUp(note="; ".join(reasons))

@@ -6,15 +6,15 @@ machine, a gap in the log, or a log of another version. Recorded logs thereby be
 
 `check` makes the decisions of a log again and compares. These deciders leave what they rest on in the log: the task
 state machine (each transition; the records show what came of it), the retry policy (on a failed attempt), the choice of
-a gateway (`gw/*/decided/placement`), and the pool's selection and eviction (`gw/*/decided/selection`, `eviction`). The
-first difference is shown with both sides. What the log does not have cannot be checked, and is counted instead: a
-gateway that is killed takes its last transitions with it, and a recorder may be started in the middle of a task. From
-the next record on, such a task is followed again.
+a gateway (`gw/*/decided/placement`), the pool's selection and eviction (`gw/*/decided/selection`, `eviction`), and the
+rounds of federated learning (`gw/*/decided/round`, by `learn.decisions`). The first difference is shown with both
+sides. What the log does not have cannot be checked, and is counted instead: a gateway that is killed takes its last
+transitions with it, and a recorder may be started in the middle of a task. From the next record on, such a task is
+followed again.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,14 +23,14 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import RecordError
-from appliance.model import Failure, SubtaskRecord, TaskRecord
+from appliance.model import Failure, SubtaskRecord, TaskRecord, keyspace
+from appliance.model.transitions import TAKES_OVER, fingerprint
 from appliance.pool.decisions import EvictionCase, SelectionCase, evict_again, select_again
 from appliance.record.models import LoggedMessage
 from appliance.record.reader import read
 from appliance.tasks import machine
 from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind
 from appliance.tasks.placement import PlacementCase, place_again
-from appliance.tasks.transition import TAKES_OVER, fingerprint
 
 
 class TaskReplay(Struct, frozen=True, kw_only=True):
@@ -107,11 +107,11 @@ def replay(path: Path) -> ReplayReport:
     counts: Counter[str] = Counter()
     for message in read(path):
         counts["messages"] += 1
-        chunks = message.key.split("/")
-        if len(chunks) < 5 or chunks[2] != "task" or chunks[4] not in ("transition", "record"):
+        topic = keyspace.topic_of(message.key)
+        if topic is not keyspace.TRANSITION and topic is not keyspace.TASK_UPDATE:
             continue
         try:
-            if chunks[4] == "transition":
+            if topic is keyspace.TRANSITION:
                 event = msgspec.json.decode(message.payload, type=Transition)
                 tasks.setdefault(event.task, _Folding()).take(event)
             else:
@@ -199,7 +199,7 @@ class Divergence(Struct, frozen=True, kw_only=True):
     """A decision that comes out differently now."""
 
     decider: str
-    """`machine`, `retry`, `placement`, `selection` or `eviction`."""
+    """`machine`, `retry`, `placement`, `selection`, `eviction` or `round`."""
     log: str
     at_ns: int
     what: str
@@ -233,13 +233,14 @@ class CheckReport(Struct, frozen=True, kw_only=True):
 class Traced(Struct, frozen=True):
     """A decider that puts each decision with all that it rests on, so that it can be made again from that alone.
 
-    A further one needs a line in `TRACED` and a put of its `case` under `gw/{gateway}/decided/{its name}`.
+    A further one needs a line in `TRACED`, or in what `check` is given beside it, and a put of its `case` under
+    `gw/{gateway}/decided/{its name}`.
     """
 
     case: type[Struct]
     """The inputs, and the decision in fields of its own."""
-    again: Callable[[Any], dict[str, Any]]
-    """Decides again; returns the decision by the names of the case's fields."""
+    again: Callable[[Any], dict[str, Any] | None]
+    """Decides again; returns the decision by the names of the case's fields, None where cases before it are missing."""
     what: Callable[[Any], str]
     """Which decision a case is of, for people."""
 
@@ -292,37 +293,34 @@ class _Task:
 
 
 class Checker:
-    """Takes the messages of one fleet's log in order."""
+    """Takes the messages of one fleet's log in order.
 
-    def __init__(self) -> None:
+    Args:
+        traced: the deciders that put what they rest on, by name.
+    """
+
+    def __init__(self, traced: Mapping[str, Traced] = TRACED) -> None:
+        self._traced = traced
         self.checked: Counter[str] = Counter()
         self.unchecked: Counter[str] = Counter()
         self.divergences: list[Divergence] = []
         self.diverged = 0
         self.tasks: dict[str, _Task] = {}
         self._log = ""
-        self._kinds: dict[tuple[str, str], Callable[[LoggedMessage], None]] = {
-            ("task", "transition"): self._transition,
-            ("task", "record"): self._record,
-            **{("decided", name): partial(self._decided, name) for name in TRACED},
-        }
 
     def take(self, message: LoggedMessage, log: str = "") -> None:
         """Make the decisions again that a message tells of."""
         self._log = log
-        chunks = message.key.split("/")
-        if message.deleted or len(chunks) < 5 or chunks[0] != "swiftbot":
+        if message.deleted:
             return
-        if chunks[2] == "task" and len(chunks) == 5:
-            handler = self._kinds.get(("task", chunks[4]))
-        elif chunks[2] == "gw" and chunks[4] == "decided" and len(chunks) == 6:
-            handler = self._kinds.get(("decided", chunks[5]))
-        else:
-            return
-        if handler is None:
-            return
+        topic = keyspace.topic_of(message.key)
         try:
-            handler(message)
+            if topic is keyspace.TRANSITION:
+                self._transition(message)
+            elif topic is keyspace.TASK_UPDATE:
+                self._record(message)
+            elif topic is keyspace.DECIDED and (what := keyspace.DECIDED.names(message.key)[1]) in self._traced:
+                self._decided(what, message)
         except _MALFORMED:
             self.unchecked["malformed"] += 1
 
@@ -403,9 +401,12 @@ class Checker:
     # --- deciders that put what they rest on --------------------------------------------------------------------
 
     def _decided(self, name: str, message: LoggedMessage) -> None:
-        traced = TRACED[name]
+        traced = self._traced[name]
         case = msgspec.json.decode(message.payload, type=traced.case)
         now = traced.again(case)
+        if now is None:
+            self.unchecked["after what is not in the log"] += 1
+            return
         self.checked[name] += 1
         logged = {field: getattr(case, field) for field in now}
         if any(_unequal(logged[field], now[field]) for field in now):
@@ -419,14 +420,24 @@ class Checker:
             )
 
 
-def check(paths: Sequence[Path], *, progress: Callable[[int], None] = lambda _: None) -> CheckReport:
+def check(
+    paths: Sequence[Path],
+    *,
+    traced: Mapping[str, Traced] = TRACED,
+    progress: Callable[[int], None] = lambda _: None,
+) -> CheckReport:
     """Make the decisions of some logs again, one log after the other as one recorder wrote them.
+
+    Args:
+        paths: the logs.
+        traced: the deciders that put what they rest on, by name.
+        progress: told how many messages were read.
 
     Raises:
         NotFoundError: no such file.
         RecordError: one is no MCAP file, or there is no decision in any.
     """
-    checker, messages = Checker(), 0
+    checker, messages = Checker(traced), 0
     problems: list[str] = []
     for path in paths:
         found: list[str] = []

@@ -2,7 +2,7 @@
 
 A finished record is kept whole while it is among the newest (`tasks.keep_finished`); then it is replaced in place by a
 small one without plan, subtasks and results (a tombstone), under the same key and version history, so that at no moment
-the id is free: it is never done again, and whoever hands it in again gets the outcome. Tombstones go after
+the id is free: it is never done again; submitted again, it is answered with the outcome. Tombstones go after
 `tasks.remember_days`, or sooner, the oldest first, where there are more than `tasks.remember_most`. What is left over
 are the effects of tasks that were trimmed or forgotten, and the checkpoints of tasks that have ended.
 
@@ -12,29 +12,24 @@ is still in the logs; `LogFiles` knows from what recorders have told which files
 
 import asyncio
 import contextlib
-import hashlib
 import time
-from collections.abc import Collection, Iterable
-from datetime import UTC, datetime
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from typing import NamedTuple
 
 import msgspec
 import structlog
 from msgspec import Struct
-from msgspec.structs import replace
 
-from appliance.errors import ConflictError, PayloadError, RefusedError, SwiftbotError, UnreachableError
-from appliance.model import Plan, Remembered, TaskRecord, TaskRequest, encode
+from appliance.errors import ConflictError, PayloadError, SwiftbotError, UnreachableError
+from appliance.model import TaskRecord, encode, keyspace
+from appliance.model.keys import RecordKind
+from appliance.model.recorder_api import RecorderStatus
 from appliance.plane.dht import LeaveOut, Record
 from appliance.plane.node import Plane
-from appliance.record.models import RecorderStatus
-from appliance.tasks import checkpoints, enquiries
-from appliance.tasks.context import PREFIX, task_key
-from appliance.tasks.records import MAX_NOTE, clean, read_record, unsettled
+from appliance.tasks.artifacts import Artifacts
+from appliance.tasks.records import PREFIX, may_trim, read_record, task_key, trimmed
 from appliance.tasks.settings import TasksConfig
 
-MAX_INSTRUCTION = 80
-"""Characters of the instruction that stay, to recognise the task by."""
 TRIMMED = LeaveOut(has=b'"remembered":{', lacks=b'"plan":')
 """What tells a tombstone as it is stored from a whole record, without decoding it.
 
@@ -49,7 +44,7 @@ class Kept(NamedTuple):
 
     key: str
     ended_ns: int
-    """Unix nanoseconds, on the clock of whoever coordinated it."""
+    """Unix nanoseconds, on its coordinator's clock."""
     trimmed: bool
     """Whether it is a tombstone already."""
 
@@ -89,75 +84,6 @@ def due(kept: Collection[Kept], *, now_ns: int, keep: int, days: float, most: in
 
 def _newest(each: Kept) -> tuple[int, str]:
     return (-each.ended_ns, each.key)
-
-
-def may_trim(record: TaskRecord) -> bool:
-    """Whether nothing is left to be done about a record: it has ended, and what a partition left of it is settled."""
-    return record.state.final and not unsettled(record)
-
-
-def trimmed(record: TaskRecord, log: str) -> TaskRecord:
-    """Return the tombstone of a finished task; `log`: names of the log files of its time, empty where none is known.
-
-    The same from whichever gateway makes it, but for the log's name: copies that meet are resolved like any records.
-    """
-    failure = record.failure
-    return TaskRecord(
-        id=record.id,
-        instruction=clean(record.instruction, MAX_INSTRUCTION),
-        submitter=record.submitter,
-        priority=record.priority,
-        state=record.state,
-        failure=None if failure is None else replace(failure, message=clean(failure.message, MAX_NOTE)),
-        cancelled_by=record.cancelled_by,
-        coordinator=record.coordinator,
-        created_ns=record.created_ns,
-        updated_ns=record.updated_ns,
-        sequence=record.sequence,
-        remembered=Remembered(log=log, request=_digest_of(record)),
-    )
-
-
-def digest(instruction: str, group: Collection[str], plan: Plan | None) -> str:
-    """Return 16 hexadecimal digits by which a request is recognised: its text, gateways, and the plan it brought."""
-    steps = [(each.id, each.skill, each.params) for each in plan.subtasks] if plan is not None else None
-    return hashlib.sha256(encode([instruction, sorted(group), steps])).hexdigest()[:16]
-
-
-def _digest_of(record: TaskRecord) -> str:
-    """The digest of the request a record was made for; empty where its plan is another one by now."""
-    edited = record.revised > 0 or (record.decision is not None and record.decision.edited)
-    if record.handed_in and edited:
-        return ""
-    return digest(record.instruction, record.within, record.plan if record.handed_in else None)
-
-
-def answered(record: TaskRecord, request: TaskRequest) -> TaskRecord:
-    """Return what a request is answered whose id is known; a note says where that was of another request."""
-    if record.remembered is None or not record.remembered.request:
-        return record
-    if record.remembered.request == digest(request.instruction, request.group, request.plan):
-        return record
-    note = (
-        f"nothing was begun: task {record.id} was another request ({record.instruction!r}); hand this one in under an "
-        "id of its own"
-    )
-    return replace(record, note=clean(note, MAX_NOTE))
-
-
-def refuse_trimmed(record: TaskRecord) -> None:
-    """Raise RefusedError for a task of which only the outcome is known: there is nothing to try again."""
-    if record.remembered is not None:
-        raise RefusedError(f"task {record.id}: {done_text(record)}; its plan is not kept", remedy="submit it anew")
-
-
-def done_text(record: TaskRecord) -> str:
-    """When a trimmed task was done, what came of it, and where its details are; empty for any other."""
-    if record.remembered is None:
-        return ""
-    at = datetime.fromtimestamp(record.updated_ns / 1e9, tz=UTC)
-    where = f"the log {record.remembered.log}" if record.remembered.log else "the logs of that day, if any were kept"
-    return f"done on {at:%Y-%m-%d %H:%M:%S} UTC ({record.state}), details are in {where}"
 
 
 MOST_FILES = 500
@@ -207,6 +133,10 @@ class LogFiles:
 
 log = structlog.get_logger(__name__)
 
+ABSENT_S = 86_400.0
+"""How long a task has no record before its files go."""
+_CUT_SHORT_S = 3600.0
+"""How old a file is that a crash has left half written: none takes so long to write."""
 AT_ONCE = 200
 """Removals in one round: a backlog must not crowd out the tasks that run."""
 
@@ -216,13 +146,33 @@ _FILES = "recorder/files"
 
 
 class Retention:
-    """Forgets in the background; `run` never ends by itself."""
+    """Forgets in the background; `run` never ends by itself.
 
-    def __init__(self, plane: Plane, config: TasksConfig) -> None:
+    Args:
+        plane: the fleet.
+        config: how much is kept.
+        artifacts: files of handlers here, which go with their task's record; None: there are none.
+        needed: whether what belongs to a run that is of no task is needed still.
+    """
+
+    def __init__(
+        self,
+        plane: Plane,
+        config: TasksConfig,
+        artifacts: Artifacts | None = None,
+        *,
+        needed: Callable[[str], Awaitable[bool]] | None = None,
+    ) -> None:
+        self._needed_elsewhere = needed
         self._plane = plane
         self._config = config
-        self._after: dict[str, str] = {}
-        """Prefix -> the key up to which was looked, where there was more than a round may look up."""
+        self._artifacts = artifacts
+        self._absent: dict[str, float] = {}
+        """Task with files here -> since when it has no record, on this machine's monotonic clock."""
+        self._owners_after = ""
+        """The owner of files up to which was looked."""
+        self._after: dict[RecordKind, str] = {}
+        """Kind -> the key up to which was looked, where there was more than a round may look up."""
         self.files = LogFiles()
         """What recorders of the fleet have written when."""
         self.forgotten = 0
@@ -233,11 +183,11 @@ class Retention:
         session = self._plane.session
         try:
             spans = msgspec.json.decode(await self._plane.store.get(_FILES) or b"[]", type=list[Span])
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, SwiftbotError) as error:
             log.warning("which log files were written when is not known any more", reason=str(error))
         else:
             self.files = LogFiles([*spans, *self.files.spans])
-        session.subscribe_typed(self._plane.keys.recorder_status(), RecorderStatus, self._on_recorder)
+        session.subscribe_typed(keyspace.RECORDER_STATUS, self._on_recorder)
         while True:
             await asyncio.sleep(self._config.retention_s)
             try:
@@ -245,6 +195,9 @@ class Retention:
                 removed = await self.round()
             except (SwiftbotError, OSError) as error:
                 log.warning("forgetting is tried again later", reason=str(error))
+                continue
+            except Exception:  # supervision boundary: a record that breaks it would end the gateway of each next owner
+                log.exception("forgetting broke off, and is tried again later")
                 continue
             if removed:
                 log.info("old records forgotten", count=removed)
@@ -257,14 +210,44 @@ class Retention:
         """Trim and remove what is due; returns how many records."""
         done = await self._old_tasks(time.time_ns())
         orphaned = [
-            *await self._orphaned("effect/", ended=False),
-            *await self._orphaned(enquiries.PREFIX, ended=False),
-            *await self._orphaned(checkpoints.PREFIX, ended=True),
+            *await self._orphaned(keyspace.EFFECT_RECORD, ended=False),
+            *await self._orphaned(keyspace.ENQUIRY_RECORD, ended=False),
+            *await self._orphaned(keyspace.CHECKPOINT_RECORD, ended=True),
         ][: AT_ONCE - done]
         for record in orphaned:
             with contextlib.suppress(ConflictError):
                 await self._plane.dht.remove(record.key, expected=record.version)
+        await self._old_files()
         return done + len(orphaned)
+
+    async def _old_files(self) -> None:
+        """Remove files whose task is gone or trimmed: those of some owners a round, all in turn."""
+        if self._artifacts is None:
+            return
+        owners = await self._artifacts.owners()
+        waiting = [owner for owner in owners if owner > self._owners_after]
+        self._owners_after = "" if len(waiting) <= AT_ONCE else waiting[AT_ONCE - 1]
+        removed = 0
+        for owner in waiting[:AT_ONCE]:
+            if owner.startswith(PREFIX) and await self._done_with(owner.removeprefix(PREFIX)):
+                removed += await self._artifacts.forget(owner)
+        removed += await self._artifacts.forget_temporary(_CUT_SHORT_S)
+        self._absent = {task: since for task, since in self._absent.items() if task_key(task) in owners}
+        if removed:
+            log.info("files of old tasks removed", count=removed)
+
+    async def _done_with(self, task: str) -> bool:
+        """Whether a task's files may go: it is trimmed, or its record has been absent for a day.
+
+        A gateway by itself, or on the small side of a partition, finds no record of tasks that the others run.
+        """
+        if await self._needed(task, ended=False):
+            self._absent.pop(task, None)
+            return False
+        if await self._plane.dht.read(task_key(task)) is not None:
+            return True
+        now = time.monotonic()
+        return now - self._absent.setdefault(task, now) >= ABSENT_S
 
     async def _owned(self, prefix: str) -> dict[str, Record]:
         return {each.key: each for each in await self._plane.dht.local(prefix) if self._plane.dht.owns(each.key)}
@@ -306,20 +289,21 @@ class Retention:
             )
         return len(trim) + len(forget)
 
-    async def _orphaned(self, prefix: str, *, ended: bool) -> list[Record]:
-        """Records whose task (the second part of their key) is gone or trimmed, or `ended`.
+    async def _orphaned(self, kind: RecordKind, *, ended: bool) -> list[Record]:
+        """Records of a kind whose task (the first name in their key) is gone or trimmed, or `ended`.
 
         A task that runs is never gone, so what belongs to it stays. What a round does not come to is the next one's.
         """
-        owned = await self._owned(prefix)
+        owned = await self._owned(kind.prefix)
         orphaned: list[Record] = []
         needed: dict[str, bool] = {}
-        after, last = self._after.pop(prefix, ""), ""
+        after, last = self._after.pop(kind, ""), ""
         for key in sorted(key for key in owned if key > after):
-            task = key.split("/")[1]
+            # Not by the kind's whole template: keys of a newer version may have more names behind it.
+            task = key.removeprefix(kind.prefix).partition("/")[0]
             if task not in needed:
                 if len(needed) >= AT_ONCE:
-                    self._after[prefix] = last
+                    self._after[kind] = last
                     break
                 needed[task] = await self._needed(task, ended=ended)
             if not needed[task]:
@@ -331,9 +315,9 @@ class Retention:
         try:
             stored = await self._plane.dht.read(task_key(task))
         except UnreachableError:
-            return True  # whoever has its record may only be away
+            return True  # the gateway that has its record may only be away
         if stored is None:
-            return False
+            return self._needed_elsewhere is not None and await self._needed_elsewhere(task)
         try:
             record = read_record(stored.value)
         except PayloadError:

@@ -4,7 +4,6 @@ It ties the plain functions of `placement` together with what is known of the fl
 and scores its members for each subtask; the fine level, the selection of a container, is the member's own.
 """
 
-import asyncio
 import hashlib
 import math
 import time
@@ -12,18 +11,20 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 
 import structlog
 
+from appliance.background import Background
 from appliance.errors import NotFoundError, SwiftbotError
-from appliance.model import GatewayStatus, Group, SubtaskRecord, TaskRecord
+from appliance.model import GatewayStatus, Group, Subtask, SubtaskRecord, TaskRecord, keyspace
+from appliance.model.task_api import SkillList, SkillsAsk
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue
 from appliance.tasks import machine
-from appliance.tasks.api import SkillList, SkillsAsk
-from appliance.tasks.context import need_of, task_key
+from appliance.tasks.orders import need_of
 from appliance.tasks.placement import (
     Asked,
     Line,
     Place,
     Placement,
+    PlacementCase,
     Standing,
     Want,
     Weights,
@@ -35,10 +36,10 @@ from appliance.tasks.placement import (
     place,
     placement_case,
     settled_load,
-    tell,
     warmth,
     why_not,
 )
+from appliance.tasks.records import task_key
 from appliance.tasks.settings import TasksConfig
 
 log = structlog.get_logger(__name__)
@@ -58,6 +59,7 @@ class Scheduler:
         wake: told a task of which a subtask may go now.
         image_of: full reference of an image of the catalogue.
         hindrance: why tasks may not command a robot just now; "" when they may.
+        closed: why a subtask may not begin just now: the place that it goes to is closed; "" when it may.
         shuns: skill, robot -> why the robot is chosen last for it, by experience; "" if nothing is against it.
     """
 
@@ -71,6 +73,7 @@ class Scheduler:
         wake: Callable[[str], None],
         image_of: Callable[[str], str],
         hindrance: Callable[[str], str] = lambda _: "",
+        closed: Callable[[Subtask], str] = lambda _: "",
         shuns: Callable[[str, str], str] = lambda _skill, _robot: "",
     ) -> None:
         self._plane = plane
@@ -79,6 +82,7 @@ class Scheduler:
         self._records = records
         self._image_of = image_of
         self._hindrance = hindrance
+        self._closed = closed
         self._shuns = shuns
         self._looked: dict[str, float] = {}
         """Task -> when its group was last looked at as a whole."""
@@ -86,7 +90,7 @@ class Scheduler:
         """Digest of a catalogue -> the skills in it."""
         self._asking: dict[str, float] = {}
         """Digest of a catalogue -> when it may be asked for again."""
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Background()
         self._asked: tuple[Placement, Asked] | None = None
         """The last placement, and what it was made from."""
         self.digest = digest_of(catalogue)
@@ -103,6 +107,8 @@ class Scheduler:
 
     def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
         """Choose the robot of a subtask, or None with the reason for the wait."""
+        if why := self._closed(target.subtask):
+            return None, f"waits: {why}"
         skills = self._catalogue.skills
         manifests = {
             each.subtask.id: skills[each.subtask.skill] for each in record.subtasks if each.subtask.skill in skills
@@ -224,14 +230,12 @@ class Scheduler:
         now = time.monotonic()
         if known is None and self._asking.get(status.catalogue, 0.0) <= now and len(self._skills) < MOST_CATALOGUES:
             self._asking[status.catalogue] = now + self._config.regroup_s
-            asking = asyncio.create_task(self._ask_skills(status.id, status.catalogue), name=f"skills of {status.id}")
-            self._tasks.add(asking)
-            asking.add_done_callback(self._tasks.discard)
+            self._tasks.start(self._ask_skills(status.id, status.catalogue), f"skills of {status.id}")
         return known
 
     async def _ask_skills(self, gateway: str, digest: str) -> None:
         try:
-            answer = await self._plane.rpc.call(gateway, "skills", SkillsAsk(), SkillList, timeout_s=2.0)
+            answer = await self._plane.rpc.call(gateway, keyspace.SKILLS, SkillsAsk())
         except SwiftbotError as error:
             log.info("a gateway does not tell its skills", gateway=gateway, reason=str(error))
             return
@@ -290,10 +294,11 @@ class Scheduler:
         self._asked = (placement, asked)
         return placement
 
-    def sent(self, record: TaskRecord, target: SubtaskRecord, placement: Placement) -> None:
-        """Tell, for the log, how the gateways stood when a subtask was sent as its placement has just said."""
+    def case(self, record: TaskRecord, target: SubtaskRecord, placement: Placement) -> PlacementCase | None:
+        """Return, for the log, how the gateways stand when a subtask is sent as its placement has just said."""
         if self._config.tell_decisions and self._asked is not None and self._asked[0] is placement:
-            tell(self._plane, placement_case(placement, self._asked[1], record, target))
+            return placement_case(placement, self._asked[1], record, target)
+        return None
 
     def likely_place(self, record: TaskRecord, target: SubtaskRecord) -> str:
         """The gateway that a subtask would be sent to now, or ""."""
@@ -312,9 +317,7 @@ class Scheduler:
 
     async def close(self) -> None:
         """Ask nothing more."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
 
     def forget(self, task: str) -> None:
         """Note that a task is not driven here any more."""

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct, field
 
 from appliance.model import Approval
-from appliance.tasks.durations import DetectionConfig
 
 Positive = Annotated[float, Meta(gt=0)]
 Part = Annotated[float, Meta(ge=0, le=1)]
@@ -62,7 +61,7 @@ class ReplanConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     robots: Literal["any", "all", "never"] = "any"
     """Which robots another may stand in for: those that the appliance chose itself (`any`), those that the operator
-    named too (`all`), or none (`never`). Whoever names a robot usually means it."""
+    named too (`all`), or none (`never`). A robot that an operator names is usually meant."""
     robot_wait_s: float = 15.0
     """How long a robot that went offline is waited for before another takes over: a link that blinks, or a gateway
     that restarts, is back within seconds."""
@@ -71,7 +70,7 @@ class ReplanConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     skills: bool = True
     """Whether alternatives that manifests declare may be used."""
     decompose: bool = True
-    """Whether the decomposer may plan anew what is left. Never for a plan that was written by hand and came with its
+    """Whether the decomposer may replan what is left. Never for a plan that was written by hand and came with its
     task."""
     max_replans: int = 2
     """New plans of the decomposer for one task; if two did not help, a person should look."""
@@ -81,6 +80,26 @@ class ReplanConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """How long it waits; then the task fails."""
     ask_s: float = 90.0
     """How long the decomposer may take, all its tiers together."""
+
+
+class DetectionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """When a run is taken for stuck or straggling."""
+
+    stuck_factor: float = 6.0
+    """A silent run of a skill that promises no signs of life is stuck after so many times what runs of it take (at the
+    quantile): ending one that only has more to do than usual costs more than waiting."""
+    stuck_minimum_s: float = 60.0
+    """Never before, unless the manifest promises signs of life more often."""
+    straggler_factor: float = 2.0
+    """A run straggles after so many times what others take (Spark's `speculation.multiplier` is 1.5, later 3)."""
+    straggler_minimum_s: float = 5.0
+    """Never before: below it moving on costs about as much as it saves."""
+    quantile: float = 0.9
+    """Which of the known durations counts: not the median, or a tenth of all runs in a spread of two would straggle."""
+    samples: int = 5
+    """Runs of a skill that must be known before its durations are believed."""
+    siblings: int = 3
+    """Finished siblings of the same skill in the same task that do as well; their largest duration counts."""
 
 
 class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -112,6 +131,8 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """How long after its deadline, or after a cancel, a silent run is given up."""
     max_artifact_mb: int = 64
     """Largest file a handler may store."""
+    artifact_copies: Annotated[int, Meta(ge=1, le=8)] = 2
+    """Gateways that keep each file of a handler, the one that made it included; with 1 it is lost with that one."""
     artifact_reserve_mb: Annotated[int, Meta(ge=0)] = 512
     """Disk left free where handlers' files are kept, MB: one that would take it is refused."""
     max_result_bytes: int = 48 * 1024
@@ -120,6 +141,9 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Largest checkpoint of a run, as JSON: it travels with the order of the next attempt. Larger things are files."""
     retention_s: float = 60.0
     """How often old records are looked for."""
+    keep_runs: Annotated[int, Meta(ge=0)] = 50
+    """Runs of federated learning that have ended which are kept in this gateway's shard, the newest; of older ones the
+    records and models are removed, unless one of the models is marked."""
     keep_finished: int = 500
     """Finished task records kept whole in this gateway's shard; of older ones the id and the outcome are remembered."""
     remember_days: Annotated[float, Meta(ge=0, le=365)] = 7.0
@@ -130,7 +154,8 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Ids remembered so in this gateway's shard, some 400 B each; beyond it the oldest are forgotten before their time,
     which is counted (`forgotten` in the gateway's status) and said in the log."""
     tell_decisions: bool = True
-    """Put each placement with all that it rested on, so that `swiftbot log check` can make it again: 1 kB a subtask."""
+    """Put each placement, and each step of a round of federated learning, with all that it rested on, so that `swiftbot
+    log check` can make it again: 1 kB a subtask, 1 kB a client and round."""
     approval: Approval = Approval.NEVER
     """Which first plans wait for an operator's approval: `never`, `dangerous` (a skill that its manifest calls so, or
     one that moves a robot that flies) or `always`. A request may ask for more, never for less. Never by default: robots

@@ -26,16 +26,16 @@ from typing import Protocol
 
 from msgspec.structs import replace
 
+from appliance.background import Background
 from appliance.errors import SwiftbotError
-from appliance.model import LogLine, Notice, RunEvent, TaskRecord
+from appliance.model import LogLine, Notice, RunEvent, TaskRecord, keyspace
+from appliance.model.keys import Keys
+from appliance.model.task_api import Line, LineKind, TaskLines, TaskLinesAsk
+from appliance.model.transitions import Transition
 from appliance.plane.dedup import Deduplicator
-from appliance.plane.keys import Keys
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Session
 from appliance.tasks import lines
-from appliance.tasks.api import TaskLines, TaskLinesAsk
-from appliance.tasks.lines import Line, LineKind
-from appliance.tasks.transition import Transition
 
 PER_TASK = 1000
 """Lines kept of one task."""
@@ -237,7 +237,7 @@ LINGER_S = 0.7
 
 
 class PlaneLike(Protocol):
-    """What a stream needs of a fleet: `plane.node.PlaneClient`."""
+    """What a stream needs of a fleet: `plane.client.PlaneClient`."""
 
     session: Session
     keys: Keys
@@ -257,7 +257,7 @@ class Stream:
         self._ask_record = ask_record
         self._queue: asyncio.Queue[Line | None] = asyncio.Queue(QUEUE)
         self._merge = Merge()
-        self._asking: set[asyncio.Task[None]] = set()
+        self._asking = Background()
         self._asked: set[str] = set()
         self._from_ns = 0
         self._ended_at: float | None = None
@@ -297,11 +297,10 @@ class Stream:
         finally:
             for closer in closers:
                 closer.close()
-            for asking in self._asking:
-                asking.cancel()
+            self._asking.cancel()
 
     def _subscribe(self) -> list[Closer]:
-        session, keys = self._plane.session, self._plane.keys
+        session = self._plane.session
 
         def on_record(_: str, record: TaskRecord | None) -> None:
             if record is not None and record.state.final and self._ended_at is None:
@@ -309,7 +308,7 @@ class Stream:
                 self._put(None)
 
         def on_log(key: str, line: LogLine | None) -> None:
-            told = lines.of_log(key.split("/")[-2], line) if line is not None else None
+            told = lines.of_log(keyspace.LOG.names(key)[0], line) if line is not None else None
             if told is not None and told.task == self._task:
                 self._put(told)
 
@@ -328,11 +327,11 @@ class Stream:
                 self._put(lines.of_transition(event))
 
         return [
-            session.subscribe_typed(keys.transition(self._task), Transition, on_transition),
-            session.subscribe_typed(keys.run(self._task), RunEvent, on_event),
-            session.subscribe_typed(keys.task(self._task), TaskRecord, on_record),
-            session.subscribe_typed(keys.log(), LogLine, on_log),
-            session.subscribe_typed(keys.notice(), Notice, on_notice),
+            session.subscribe_typed(keyspace.TRANSITION, on_transition, self._task),
+            session.subscribe_typed(keyspace.RUN_EVENT, on_event, self._task),
+            session.subscribe_typed(keyspace.TASK_UPDATE, on_record, self._task),
+            session.subscribe_typed(keyspace.LOG, on_log),
+            session.subscribe_typed(keyspace.NOTICE, on_notice),
         ]
 
     def _put(self, line: Line | None) -> None:
@@ -370,9 +369,7 @@ class Stream:
 
     def _ask_newcomers(self) -> None:
         for gateway in self._plane.members() - self._asked:
-            asking = asyncio.create_task(self._ask(gateway), name=f"lines of {gateway}")
-            self._asking.add(asking)
-            asking.add_done_callback(self._asking.discard)
+            self._asking.start(self._ask(gateway), f"lines of {gateway}")
 
     async def _ask(self, gateway: str) -> None:
         """Ask a gateway for its lines, and for its time, by which all its lines are put into order."""
@@ -380,7 +377,7 @@ class Stream:
         asked_ns = time.time_ns()
         try:
             answer = await self._plane.rpc.call(
-                gateway, "task_lines", TaskLinesAsk(task=self._task), TaskLines, timeout_s=ASK_S
+                gateway, keyspace.TASK_LINES, TaskLinesAsk(task=self._task), timeout_s=ASK_S
             )
         except SwiftbotError:
             return  # what it says from now on is heard all the same

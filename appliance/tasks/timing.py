@@ -5,7 +5,7 @@ The record carries the seconds that had passed at its last transition, each meas
 its own monotonic clock, so no clocks are compared. What passes between the last transition and a takeover is known to
 those who heard that record: they count on from when they heard it (`Ages`).
 
-**Backoff** (`Pace`): when each subtask of a task may be tried next, and what the waiting ones wait for.
+**Backoff** (`Backoff`): when each subtask of a task may be tried next, and what the waiting ones wait for.
 """
 
 import math
@@ -61,7 +61,7 @@ class Ages:
         try:
             age = msgspec.json.decode(message.payload, type=_Age)
         except (msgspec.DecodeError, UnicodeDecodeError):
-            return  # whoever keeps the record counts it
+            return  # the gateway that keeps the record counts it
         if not message.key.endswith(f"/task/{age.id}/record"):
             return
         since = self._clock() - age.elapsed_s
@@ -81,7 +81,7 @@ LOOK_AGAIN_S = 0.5
 """How soon after it could not be placed a subtask is tried again."""
 
 
-class Pace:
+class Backoff:
     """The waits of one task's subtasks; times in seconds on this machine's monotonic clock."""
 
     def __init__(self) -> None:

@@ -14,94 +14,23 @@ from msgspec.structs import replace
 
 from appliance.errors import NotFoundError
 from appliance.model import (
-    PLAIN_PRIORITY,
     Attempt,
-    Choice,
     Decision,
     Failure,
     Group,
     Proposal,
     Revision,
     SubtaskRecord,
+    SubtaskState,
     TaskRecord,
     TaskState,
     Word,
 )
-from appliance.tasks.retention import done_text
+from appliance.model.task_api import AttemptWhy, SubtaskWhy, TaskWhy, Waits
+from appliance.tasks.records import done_text
 
 WAITS = "waits for "
 """How the note of a subtask begins that waits for something outside of the task."""
-
-
-class AttemptWhy(Struct, frozen=True, kw_only=True):
-    """One attempt; `choice` is None where it was never served, or by a version that did not tell."""
-
-    number: int
-    gateway: str
-    container: str | None
-    phase: str | None
-    placed: str
-    """Why this gateway was asked first: coarse scores, best first."""
-    choice: Choice | None
-    """Which gateway decided, and what it weighed."""
-    failure: Failure | None
-
-
-class CandidateWhy(Struct, frozen=True, kw_only=True):
-    """A gateway with its coarse score for a subtask, or why it is no candidate."""
-
-    gateway: str
-    score: float | None = None
-    excluded: str = ""
-
-
-class Waits(Struct, frozen=True, kw_only=True):
-    """What a subtask that has not ended waits for, as its coordinator knows it just now."""
-
-    reason: str
-    at: str = ""
-    """The gateway in whose queue it is; empty: it is with its coordinator."""
-    position: int = 0
-    """Its place in that queue or among those that wait for room, from 1; 0: in none."""
-    waiting: int = 0
-    expected_s: float | None = None
-    """In how many seconds it is expected to start; None: not known."""
-    candidates: tuple[CandidateWhy, ...] = ()
-    """The best first, then those that cannot serve it."""
-
-
-class SubtaskWhy(Struct, frozen=True, kw_only=True):
-    """A subtask with its attempts; `note` says what one without any waits for."""
-
-    id: str
-    skill: str
-    state: str
-    note: str
-    attempts: tuple[AttemptWhy, ...]
-    waits: Waits | None = None
-    """None where it has ended, or the coordinator was not asked."""
-
-
-class TaskWhy(Struct, frozen=True, kw_only=True):
-    """A task with the reasons for where its subtasks ran."""
-
-    id: str
-    state: str
-    coordinator: str
-    subtasks: tuple[SubtaskWhy, ...]
-    submitter: str = ""
-    priority: int = PLAIN_PRIORITY
-    deadline_s: float = 0.0
-    left_s: float | None = None
-    """Seconds until its deadline; None without one, or where the coordinator was not asked."""
-    note: str = ""
-    """What it had to expect when it was accepted and planned."""
-    group: Group | None = None
-    """The gateways that serve it, its root, and how that came about."""
-    waits: str = ""
-    """What the task or subtasks of it wait for: an operator's approval, the end of a pause, a robot that was lost."""
-    done: str = ""
-    """Of a task whose record was trimmed: when it was done, and where its details are."""
 
 
 def why(record: TaskRecord, subtask: str = "") -> TaskWhy:
@@ -136,6 +65,28 @@ def waits_for(record: TaskRecord) -> str:
         return record.paused
     notes = [each.note for each in record.subtasks if not each.state.final and each.note.startswith(WAITS)]
     return "; ".join(dict.fromkeys(note.removeprefix(WAITS) for note in notes))
+
+
+STATUSES = (*map(str, TaskState), "paused", "needs approval", "blocked")
+"""What `status` may return."""
+
+
+def status(record: TaskRecord) -> str:
+    """Return a task's state as people see it.
+
+    A task whose robots are stopped, whose plan nobody has approved, or of which nothing runs for want of something
+    outside, is `running` in its record and does not move: `paused`, `needs approval`, `blocked`.
+    """
+    if record.state.final:
+        return str(record.state)
+    if record.paused:
+        return "paused"
+    if record.proposal is not None and record.proposal.waits:
+        return "needs approval"
+    active = (SubtaskState.DISPATCHED, SubtaskState.RUNNING)
+    held = [each for each in record.subtasks if not each.state.final and each.note.startswith(WAITS)]
+    moving = [each for each in record.subtasks if each.state in active and each not in held]
+    return "blocked" if record.state is TaskState.RUNNING and held and not moving else str(record.state)
 
 
 def with_waits(found: TaskWhy, waits: Mapping[str, Waits], *, left_s: float | None) -> TaskWhy:
@@ -205,6 +156,9 @@ class TaskView(Struct, frozen=True, kw_only=True):
     id: str
     instruction: str
     state: str
+    """Of the state machine."""
+    status: str
+    """As people see it: the state, or `paused`, `needs approval`, `blocked`."""
     submitter: str
     coordinator: str
     priority: int
@@ -247,6 +201,7 @@ def view(record: TaskRecord) -> TaskView:
         id=record.id,
         instruction=record.instruction,
         state=str(record.state),
+        status=status(record),
         submitter=record.submitter,
         coordinator=record.coordinator,
         priority=record.priority,

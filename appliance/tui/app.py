@@ -1,42 +1,52 @@
-"""The terminal UI itself: the window, its screens and dialogs, what becomes of keys and commands, and how it is run.
+"""The application of the terminal UI: its screens, what keys and commands do, and how it is run.
 
-`Shell` is Textual's part, nothing else: which screens there are, when the one that is seen is drawn, and in which
-colours. It works at 80 columns by 24 lines over SSH, draws a few times a second and only what changed, and never stops
-because the network does. `Ordering` takes what a person wants from key or command line to what came of it: asked,
-allowed, confirmed, carried out, told. `SwiftbotApp` adds what the UI's own actions do, and the change to a recorded log
-and back. `run_tui` runs it in a terminal until the person leaves, `export_picture` without one for a picture of it.
+It works at 80 columns by 24 lines over SSH, draws a few times a second and only what changed, and never stops because
+the network does. An operation goes from key, command line or palette to its outcome: arguments asked for, allowed,
+confirmed, carried out, shown. `run_tui` runs it in a terminal until the person leaves. Styles are in
+`app.tcss`.
 """
 
 import contextlib
 import re
+import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar, cast
 
 import structlog
-from rich.console import RenderableType
-from textual.app import App, SystemCommand
+from rich.console import Group, RenderableType
+from rich.text import Text
+from textual.app import App
+from textual.command import DiscoveryHit, Hit, Hits, Provider
 from textual.css.query import NoMatches
-from textual.screen import Screen
+from textual.driver import Driver
+from textual.notifications import SeverityLevel
 from textual.widgets import Input
 
-from appliance.errors import ConfigError, SwiftbotError, UnreachableError
+from appliance.alerts.rules import ordered
+from appliance.errors import ConfigError, PayloadError, SwiftbotError, UnreachableError
 from appliance.llm.stop_words import stop_request
+from appliance.llm.training_words import training_request
 from appliance.model import Approval, TaskRecord
 from appliance.model.messages import enums_open
+from appliance.model.roles import lacks
+from appliance.operations import STOP_IN_WORDS, Operation
 from appliance.plane.settings import PlaneConfig
 from appliance.process import gentle_collector
-from appliance.tui import actions, command_line, themes
-from appliance.tui.actions import PROMPTS, STOP_IN_WORDS, bindings, key_name, keymap, keys_of
+from appliance.tui import actions, command_line, task_view, themes
+from appliance.tui.actions import PROMPTS, bindings, key_name, keymap, keys_of, shown
+from appliance.tui.ascii_terminal import driver_for, in_browser
 from appliance.tui.base_screen import FleetScreen
 from appliance.tui.command_line import Command
-from appliance.tui.replay import ReplayView
-from appliance.tui.safe import safe
+from appliance.tui.replay import ReplayView, faster, rate_of, slower
+from appliance.tui.safe import clip, safe
+from appliance.tui.screens.alerts import AlertsScreen
 from appliance.tui.screens.fleet import FleetOverview, PoolScreen
+from appliance.tui.screens.learning import LearningScreen
 from appliance.tui.screens.logs import LogScreen
-from appliance.tui.screens.models import LearningScreen, LlmScreen
+from appliance.tui.screens.models import LlmScreen
 from appliance.tui.screens.replay import ReplayScreen
 from appliance.tui.screens.review import ReviewScreen
 from appliance.tui.screens.robots import RobotsScreen
@@ -64,13 +74,49 @@ SCREENS: dict[str, type[FleetScreen]] = {
 _FONT = re.compile(r"@font-face \{[^}]*\}\s*")
 
 
-class Shell(App[None], inherit_bindings=False):
-    """A window on a view of a fleet: what is seen of it, when it is drawn, and in which colours.
+log = structlog.get_logger(__name__)
+
+NOTICE_CELLS = 180
+"""Of a line of a notice: three lines of a window of 80 columns. The log screen has all of it."""
+REPLAY_STEP_S = 10.0
+"""How far a key goes in a recorded log."""
+_UNSAID = ("stops", "alerts", "robots", "unknown", "roster")
+"""Arguments that no person writes."""
+
+
+class OperationProvider(Provider):
+    """Offers every operation of the registry in the command palette."""
+
+    async def discover(self) -> Hits:
+        """Yield all of them, in the order of the help."""
+        for operation in actions.ACTIONS:
+            yield DiscoveryHit(operation.title, self._call(operation), help=_palette_help(operation))
+
+    async def search(self, query: str) -> Hits:
+        """Yield those whose title or help matches."""
+        matcher = self.matcher(query)
+        for operation in actions.ACTIONS:
+            text = _palette_help(operation)
+            score = max(matcher.match(operation.title), matcher.match(text) / 2)
+            if score > 0:
+                yield Hit(score, matcher.highlight(operation.title), self._call(operation), help=text)
+
+    def _call(self, operation: Operation) -> Callable[[], None]:
+        return partial(cast("SwiftbotApp", self.app).action_act, operation.name)
+
+
+def _palette_help(operation: Operation) -> str:
+    return f"{operation.help} ({shown(operation)})" if operation.keys else operation.help
+
+
+class SwiftbotApp(App[None], inherit_bindings=False):
+    """The terminal UI on a view of a fleet. What an action of its own does is a method `do_NAME`.
 
     Args:
         view: What is shown; closed with the app.
         config: How it looks and how often it is drawn.
         history: Instructions submitted before; kept in memory alone when none is given.
+        driver: What writes to the terminal, if not Textual's own.
     """
 
     TITLE = "SwiftBot"
@@ -79,17 +125,18 @@ class Shell(App[None], inherit_bindings=False):
     DEFAULT_MODE = "fleet"
     ENABLE_COMMAND_PALETTE: ClassVar[bool] = False
     """Textual would bind ^p to it for good; it is there all the same, under the keys of the action `palette`."""
-    CSS = """
-    ModalScreen { align: center middle; }
-    .dialog { width: 90%; max-width: 110; height: 80%; border: round $accent; background: $surface; padding: 0 1; }
-    .small { height: auto; width: 60; }
-    .title { text-style: bold; }
-    #plan-box { height: 1fr; scrollbar-size: 1 1; }
-    #hint { color: $text-muted; }
-    VerticalScroll { scrollbar-size: 1 1; }
-    """
+    COMMANDS = {OperationProvider}  # pyright: ignore[reportAssignmentType] - of one class
+    # Absolute: Textual looks beside the module of a subclass otherwise.
+    CSS_PATH = Path(__file__).with_name("app.tcss")
 
-    def __init__(self, view: View, config: TuiConfig | None = None, *, history: History | None = None) -> None:
+    def __init__(
+        self,
+        view: View,
+        config: TuiConfig | None = None,
+        *,
+        history: History | None = None,
+        driver: type[Driver] | None = None,
+    ) -> None:
         self.config = config or TuiConfig()
         self.config.check()
         self._own_keys = keymap(self.config.keys)
@@ -98,7 +145,7 @@ class Shell(App[None], inherit_bindings=False):
             raise ConfigError(f"tui.theme is {self.config.theme!r}", remedy=f"there are: {known}")
         self._look = ""
         """The theme that styles were worked out for."""
-        super().__init__()
+        super().__init__(driver_class=driver)
         self.use_command_palette = True
         self.view = view
         self.history = history or History(None)
@@ -156,7 +203,7 @@ class Shell(App[None], inherit_bindings=False):
         super().delay_update(min(delay, 0.005))
 
     def refresh_css(self, animate: bool = True) -> None:
-        """Work out the styles anew when the colours have changed.
+        """Work out the styles again when the colours have changed.
 
         Textual does so whenever a screen is shown for the first time as well, which is styled with these colours as it
         is made: that took longer than all else of showing it.
@@ -181,12 +228,32 @@ class Shell(App[None], inherit_bindings=False):
         self.ansi_theme_dark = self.ansi_theme_light = look.terminal()
         self.theme = name
 
-    # --- what is told -----------------------------------------------------------------------------------------
+    # --- messages --------------------------------------------------------------------------------------------
 
     def tell(self, error: SwiftbotError) -> None:
-        """Show an error with its remedy."""
+        """Show an error with its remedy; the log screen keeps it."""
+        self.view.store.add(time.time_ns(), kind="order", level="error", source="tui", text=str(error))
         remedy = f"\n→ {safe(error.remedy)}" if error.remedy else ""
-        self.notify(f"{safe(error.message)}{remedy}", title="Error", severity="error", timeout=10, markup=False)
+        self.notify(f"✘ {safe(error.message)}{remedy}", severity="error", timeout=10, markup=False)
+
+    def notify(
+        self,
+        message: str,
+        *,
+        title: str = "",
+        severity: SeverityLevel = "information",
+        timeout: float | None = None,
+        markup: bool = True,
+    ) -> None:
+        """Show a notice; of more than there is room for the latest are seen, and of long ones the beginning."""
+        message = "\n".join(clip(line, NOTICE_CELLS) for line in message.splitlines()[:4])
+        super().notify(message, title=title, severity=severity, timeout=timeout, markup=markup)
+        self.call_later(self._drop_notices)
+
+    def _drop_notices(self) -> None:
+        """Take away those that there is no room for, the oldest first."""
+        for older in list(self._notifications)[: -max(2, self.size.height // 10)]:
+            self._unnotify(older)
 
     def read(self, title: str, content: RenderableType) -> None:
         """Show something to be read at leisure."""
@@ -196,18 +263,14 @@ class Shell(App[None], inherit_bindings=False):
         """Write a picture of the screen as it is now, without references to fonts on other machines."""
         path.write_text(_FONT.sub("", self.export_screenshot(title=f"SwiftBot · {self.view.fleet}")))
 
-
-log = structlog.get_logger(__name__)
-
-_UNSAID = ("stops", "robots", "unknown", "roster")
-"""Arguments that nobody has written."""
-
-
-class Ordering(Shell):
-    """A window that takes orders. What an action does here is a method `do_NAME` of a subclass."""
+    # --- orders --------------------------------------------------------------------------------------------------
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Leave the keys of the prompt to whatever is being written, and to dialogs."""
+        if action == "act" and parameters and (found := actions.BY_NAME.get(str(parameters[0]))) is not None:
+            front = self.front
+            if found.recorded and self.view.steerable and (front is None or front.scope != "replay"):
+                return False  # the key is whatever else there is
         if action == "act" and parameters and parameters[0] in PROMPTS:
             return not isinstance(self.focused, Input) and isinstance(self.screen, FleetScreen)
         return super().check_action(action, parameters)
@@ -241,6 +304,11 @@ class Ordering(Shell):
         action = command.action
         if action.call == "submit" and self.stops_in_words(command.given.get("instruction", "")):
             return
+        if action.writes and (own := self.view.role) is not None and lacks(own, action.role):
+            self.notify(
+                f"{action.name} needs the role {action.role}; your certificate is a {own}'s", severity="warning"
+            )
+            return
         if action.writes and not (action.always and self._steered.steerable) and not self._allowed():
             return
         if command.missing:
@@ -249,9 +317,8 @@ class Ordering(Shell):
             method, _, fixed = action.call.partition(" ")
             getattr(self, f"do_{method}")(*([fixed] if fixed else []), command.given)
         elif action.dangerous:
-            if action.sees_stops:
-                # Before the question: what is stopped while it is open was not seen.
-                command.given["stops"] = "/".join(each.id for each in self.view.store.stops.active)
+            # Before the question: what is stopped, or begins, while it is open was not seen.
+            command.given.update({name: self._seen(name) for name in action.seen})
 
             def answered(yes: bool | None) -> None:
                 if yes:
@@ -261,6 +328,12 @@ class Ordering(Shell):
         else:
             self.carry_out(command)
 
+    def _seen(self, what: str) -> str:
+        store = self.view.store
+        if what == "stops":
+            return "/".join(each.id for each in store.stops.active)
+        return "/".join(each.id for each in ordered(store.alerts.values()) if each.acked is None)
+
     def stops_in_words(self, text: str) -> bool:
         """Carry a text out that is a soft stop, as the stop key does it, read-only as well; False when it is none."""
         view = self._steered
@@ -269,6 +342,20 @@ class Ordering(Shell):
             return False
         given = {"robots": "/".join(stop.robots), "unknown": "/".join(stop.unknown), "roster": "/".join(roster)}
         self.carry_out(Command(action=STOP_IN_WORDS, given={**given, "why": text}))
+        return True
+
+    def trains_in_words(self, text: str) -> bool:
+        """Ask about the run of federated learning that a text asks for, then start it; False when it is none.
+
+        One on robots that there are not is left to the planner, which refuses it with the command.
+        """
+        training = training_request(text, tuple(self.view.store.robots))
+        if training is None or training.unknown:
+            return False
+        given = {"recipe": training.recipe, "robots": ",".join(training.robots), "why": text}
+        if training.rounds is not None:
+            given["rounds"] = str(training.rounds)
+        self.call_later(self.begin, command_line.fill(actions.BY_NAME["learn-start"], given, {}))
         return True
 
     def _allowed(self) -> bool:
@@ -320,10 +407,9 @@ class Ordering(Shell):
 
     async def _carry_out(self, command: Command, line: str) -> None:
         action = command.action
-        assert action.do is not None  # noqa: S101 - what has no call has this
         view = self._steered if action.always else self.view
         try:
-            answer = await action.do(view.orders, command.given, view.operator)
+            outcome = await action.run(view.orders, command.given)
         except SwiftbotError as error:
             if action.always and isinstance(error, UnreachableError):
                 error.remedy = "stop the robots by their own means"
@@ -333,15 +419,19 @@ class Ordering(Shell):
             log.exception("an order failed", order=line)
             self.notify(f"internal error: {safe(repr(error), 200)}", severity="error", markup=False)
         else:
-            if isinstance(answer, TaskRecord):
+            text = outcome.text
+            if isinstance(outcome.value, TaskRecord):
                 # It is heard as well, but perhaps later than the person looks.
-                self.view.store.take_task(answer)
-                answer = f"task {answer.id}: {state_cell(answer)[0]}"
+                self.view.store.take_task(outcome.value)
+                text = text or f"task {outcome.value.id}: {state_cell(outcome.value)[0]}"
             if action.long:
-                self.push_screen(TextDialog(f":{safe(line, 80)}", answer))
+                body = Text(text) if isinstance(text, str) else text
+                notes = (Text(note, "yellow") for note in outcome.notes)
+                self.push_screen(TextDialog(f":{safe(line, 80)}", Group(body, *notes)))
             else:
-                self.note(line, str(answer))
-                self.notify(safe(answer), markup=False)
+                text = "; ".join((str(text), *outcome.notes))
+                self.note(line, text)
+                self.notify(safe(text), markup=False)
         finally:
             self.under_way.pop(line, None)
             with contextlib.suppress(NoMatches):  # an answer may come while the screen goes
@@ -352,9 +442,7 @@ class Ordering(Shell):
         text = f":{line} → {outcome}"
         self.view.store.add(time.time_ns(), kind="order", level=level, source=self.view.operator, text=text)
 
-
-class SwiftbotApp(Ordering):
-    """The terminal UI on a view of a fleet."""
+    # --- what its own actions do ---------------------------------------------------------------------------------
 
     def do_screen(self, name: str, _given: Mapping[str, str]) -> None:
         """Show a screen; from what was drilled into there, its beginning."""
@@ -363,6 +451,11 @@ class SwiftbotApp(Ordering):
                 self.pop_screen()
             return
         self.switch_mode(name)
+
+    def do_alerts(self, _given: Mapping[str, str]) -> None:
+        """Show the alerts, over whatever is seen."""
+        if not isinstance(self.screen, AlertsScreen):
+            self.push_screen(AlertsScreen())
 
     def do_here(self, name: str, given: Mapping[str, str]) -> None:
         """Do what the screen that is seen has under this name."""
@@ -391,12 +484,22 @@ class SwiftbotApp(Ordering):
             instruction=given.get("instruction", ""),
             own=self.config.keys,
             stops=self.stops_in_words,
+            trains=self.trains_in_words,
         )
         self.push_screen(dialog, submitted)
 
     def do_review(self, given: Mapping[str, str]) -> None:
-        """Look at the plan of a task that waits for approval."""
-        self.push_screen(ReviewScreen(given["task"]))
+        """Look at the plan of a task that waits for approval: of the selected task, else the one that waits longest."""
+        tasks = self.view.store.tasks
+        record = tasks.get(given["task"])
+        if record is not None and task_view.waits(record) is None:
+            waiting = [each for each in tasks.values() if task_view.waits(each) is not None]
+            if not waiting:
+                self.notify(f"no plan of {safe(record.id, 64)} waits for approval", markup=False)
+                return
+            record = min(waiting, key=lambda each: (each.created_ns, each.id))
+            self.notify(f"this is the plan of {safe(record.id, 64)}, which waits longest", markup=False)
+        self.push_screen(ReviewScreen(record.id if record is not None else given["task"]))
 
     def do_takeover(self, given: Mapping[str, str]) -> None:
         """Take a robot over, after asking."""
@@ -407,8 +510,8 @@ class SwiftbotApp(Ordering):
                 self.push_screen(TakeoverScreen(robot, why=given.get("why", "")))
 
         question = (
-            f"Take {robot} over? It holds and obeys nobody else until you give it back; what it does for a task waits "
-            "or fails. It is given back when you leave the screen."
+            f"Take {robot} over? It holds and obeys only you until you release it; what it does for a task waits "
+            "or fails. It is released when you leave the screen."
         )
         self.push_screen(ConfirmDialog(safe(question)), answered)
 
@@ -431,6 +534,31 @@ class SwiftbotApp(Ordering):
             self.behind = self.view
         await self._show_view(replay)
         self.do_screen("replay", {})
+
+    def do_replay(self, name: str, given: Mapping[str, str]) -> None:
+        """Play, pause, seek or change the rate of the log that is shown, on whichever screen."""
+        replay = self.view
+        if not isinstance(replay, ReplayView):
+            self.notify(
+                "no log is open\n→ Enter on a file of screen 8, or :open FILE", severity="warning", markup=False
+            )
+            return
+        try:
+            match name:
+                case "play":
+                    replay.play()
+                case "ahead" | "behind":
+                    replay.step(REPLAY_STEP_S if name == "ahead" else -REPLAY_STEP_S)
+                case "faster" | "slower":
+                    replay.change_rate(faster if name == "faster" else slower)
+                case "rate":
+                    rate = rate_of(given["rate"])
+                    replay.change_rate(lambda _: rate)
+                case _:
+                    replay.seek(given["time"])
+        except PayloadError as error:
+            self.notify(f"{safe(error.message)}\n→ {error.remedy}", severity="error", markup=False)
+        self.draw(force=True)
 
     def do_live(self, _given: Mapping[str, str]) -> None:
         """Show the fleet again."""
@@ -483,7 +611,7 @@ class SwiftbotApp(Ordering):
         self.screen.focus_previous()
 
     def do_copy(self, _given: Mapping[str, str]) -> None:
-        """Copy what is marked; without any text marked, whoever wanted to interrupt is told how to leave."""
+        """Copy what is marked; without any text marked, show how to leave."""
         marked = self.screen.get_selected_text()
         if marked:
             self.copy_to_clipboard(marked)
@@ -538,38 +666,6 @@ class SwiftbotApp(Ordering):
         """Leave; the fleet goes on."""
         self.exit()
 
-    def get_system_commands(self, screen: Screen[Any]) -> Iterable[SystemCommand]:
-        """Offer the same actions in the command palette."""
-        _ = screen
-        for action in actions.ACTIONS:
-            keys = f" ({action.shown})" if action.keys else ""
-
-            async def call(name: str = action.name) -> None:
-                self.action_act(name)
-
-            yield SystemCommand(action.title, f"{action.help}{keys}", call)
-
-
-async def export_picture(
-    view: View, path: Path, *, keys: tuple[str, ...] = ("2",), size: tuple[int, int] = (100, 30)
-) -> None:
-    """Run the terminal UI without a terminal on `view`, press `keys`, write its picture to `path` as SVG.
-
-    Args:
-        view: What is shown.
-        path: SVG file to write.
-        keys: Keys pressed first, in Textual's names.
-        size: Columns and lines.
-    """
-    app = SwiftbotApp(view)
-    async with app.run_test(size=size) as pilot:
-        await pilot.pause()
-        await pilot.press(*keys)
-        await pilot.pause(0.5)
-        app.draw(force=True)
-        await pilot.pause()
-        app.export_svg(path)
-
 
 async def run_tui(
     plane_config: PlaneConfig, fleet: str, config: TuiConfig | None = None, *, replay: Path | None = None
@@ -579,13 +675,18 @@ async def run_tui(
     Log lines of this process go to its log screen meanwhile: on the terminal they would spoil the picture.
 
     Raises:
-        ConfigError: a setting cannot work.
+        ConfigError: a setting cannot work, or there is no terminal.
         NotFoundError, RecordError: the recorded log cannot be read.
     """
     config = config or TuiConfig()
     config.check()
+    if not (in_browser() or (sys.stdin.isatty() and sys.stdout.isatty())):
+        raise ConfigError(
+            "the terminal UI needs a terminal: standard input or output is a file or a pipe",
+            remedy="run it in a terminal, or `swiftbot tui --serve` for browsers",
+        )
     view = FleetView(plane_config, fleet, config) if replay is None else await ReplayView.open(replay, config)
-    app = SwiftbotApp(view, config, history=History(default_file()))
+    app = SwiftbotApp(view, config, history=History(default_file()), driver=driver_for(config))
     before = structlog.get_config()
     structlog.configure(
         processors=[structlog.processors.add_log_level, partial(take_own_log, view.store)],

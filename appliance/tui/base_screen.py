@@ -17,10 +17,15 @@ from textual.screen import Screen
 from textual.widget import Widget
 from textual.widgets import Static
 
+from appliance.alerts.rules import open_counts
+from appliance.errors import SwiftbotError
+from appliance.model.roles import lacks
+from appliance.operations import Operation
+from appliance.reasons import time_of_day
 from appliance.tui import actions
-from appliance.tui.actions import Action, key_name, keys_of
+from appliance.tui.actions import key_name, keys_of
 from appliance.tui.command_line import Filter
-from appliance.tui.formatting import counted, time_of_day
+from appliance.tui.formatting import counted
 from appliance.tui.safe import safe
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Store
@@ -48,6 +53,10 @@ class Host(Protocol):
         """Return command lines that go on from this one."""
         ...
 
+    def tell(self, error: SwiftbotError) -> None:
+        """Show an error with its remedy."""
+        ...
+
 
 class FleetScreen(Screen[None], inherit_bindings=False):
     """A screen of the terminal UI. Subclasses say what they are and show, and make and draw their body."""
@@ -61,13 +70,6 @@ class FleetScreen(Screen[None], inherit_bindings=False):
 
     # Textual's own choice, on a screen without tables, is the hidden prompt: keys would be written there unseen.
     AUTO_FOCUS = "#body *"
-    DEFAULT_CSS = """
-    FleetScreen { layout: vertical; background: $background; color: $foreground; }
-    FleetScreen #head { height: 2; background: $panel; color: $foreground; }
-    FleetScreen #banner { height: auto; max-height: 3; background: $error; color: $background; padding: 0 1; }
-    FleetScreen #body { height: 1fr; }
-    FleetScreen #foot { height: 1; background: $panel; color: $foreground; }
-    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,7 +89,7 @@ class FleetScreen(Screen[None], inherit_bindings=False):
     # --- what subclasses make ------------------------------------------------------------------------------------
 
     def body(self) -> ComposeResult:
-        """Make what stands between header and footer."""
+        """Make the parts between header and footer."""
         yield from ()
 
     def draw_body(self, store: Store) -> None:
@@ -104,7 +106,7 @@ class FleetScreen(Screen[None], inherit_bindings=False):
         return self._ready
 
     def title_of(self) -> str:
-        """Return what stands beside the screen's name in the header, such as what was drilled into."""
+        """Return the text beside the screen's name in the header, such as what was drilled into."""
         return ""
 
     # --- what they use ---------------------------------------------------------------------------------------------
@@ -181,7 +183,8 @@ class FleetScreen(Screen[None], inherit_bindings=False):
         host = self.host
         said = (
             store.connection, present, len(store.robots), running, host.unlocked, tuple(host.under_way),
-            self.size.width, self.title_of(), tuple(self.chosen()), pressing,
+            self.size.width, self.title_of(), tuple(self.chosen()), pressing, host.view.moment,
+            open_counts(store.alerts.values()),
         )  # fmt: skip
         if said == self._said and not force:
             return
@@ -189,14 +192,18 @@ class FleetScreen(Screen[None], inherit_bindings=False):
         lost = len(store.gateways) - present
         gateways = f"{present} gw{f' ({lost} lost)' if lost else ''}"
         counts = f"{gateways} · {counted(len(store.robots), 'robot')} · {running} active"
-        # Of fixed height: nothing has to be laid out anew for them.
+        # Of fixed height: no layout pass is needed for them.
         self.query_one("#head", Bar).update(self._head(counts, pressing), layout=False)
         self.query_one("#foot", Bar).update(self._foot(), layout=False)
         self._draw_banner(store)
 
     def _count(self, store: Store) -> tuple[int, str]:
         """Return how many tasks go on, and in words what must not be overlooked on any screen."""
-        seen = (store, store.revisions(("tasks", "enquiries", "stops", "recorders")), store.robots.arrangement)
+        seen = (
+            store,
+            store.revisions(("tasks", "enquiries", "stops", "recorders", "alerts")),
+            store.robots.arrangement,
+        )
         if self._counted[0] != seen:
             active = [record for record in store.tasks.values() if not record.state.final]
             waiting = sum(record.proposal is not None and record.proposal.waits for record in active)
@@ -205,7 +212,8 @@ class FleetScreen(Screen[None], inherit_bindings=False):
             if store.stops.active:
                 held = sum(store.stops.of(name) is not None for name in store.robots)
                 parts.insert(0, "■ ALL STOPPED" if held == len(store.robots) else f"■ {held} stopped")
-            if missed := sum(sum(each.missed.values()) for each in store.recorders.values()):
+            unacked = [each for name, each in store.recorders.items() if not store.acked(f"recorder.{name}")]
+            if missed := sum(sum(each.missed.values()) for each in unacked):
                 parts.append(f"▲ log misses {missed:,}")
             self._counted = (seen, len(active), " · ".join(parts))
         return self._counted[1], self._counted[2]
@@ -215,16 +223,35 @@ class FleetScreen(Screen[None], inherit_bindings=False):
         mode = "[W] unlocked" if host.unlocked else "[R] read-only"
         if not host.view.steerable:
             mode = "[R] recorded"
+        alerts = self._alerts()
         pending = "".join(f" · … {each}" for each in host.under_way)
         # What presses takes the place of the name: at 80 columns there is no room for both.
         name = f" {pressing} · " if pressing else " SwiftBot "
         style = "bold yellow" if pressing else "bold"
+        if host.view.moment:
+            # What was must not be taken for what is, on whichever screen.
+            name, style = f" RECORDED {host.view.moment} ", "bold reverse"
         rest = f"{safe(host.view.fleet, 40)} · {counts}{safe(pending, 60)}"
         first = Text.assemble((name, style), rest, no_wrap=True)
-        first.truncate(max(0, width - len(mode) - 2), overflow="ellipsis", pad=True)
+        first.truncate(max(0, width - len(mode) - 2 - cell_len(alerts.plain)), overflow="ellipsis", pad=True)
+        first.append_text(alerts)
         first.append(f" {mode} ", "bold yellow" if host.unlocked else "bold")
         first.truncate(width)
         return Text("\n").join((first, self._tabs(width)))
+
+    def _alerts(self) -> Text:
+        """Return how many alerts nobody has acknowledged, with the key to them; empty when there are none."""
+        critical, warnings = open_counts(self.store.alerts.values())
+        if not critical and not warnings:
+            return Text()
+        click = Style(meta={"@click": "app.act('alerts')"})
+        key = key_name(keys_of(actions.BY_NAME["alerts"], self.host.config.keys)[0])
+        out = Text(f" {key}", Style(bold=True) + click)
+        if critical:
+            out.append(f" ✘{critical} ", Style.parse("bold reverse red") + click)
+        if warnings:
+            out.append(f" ▲{warnings} ", Style.parse("bold reverse yellow") + click)
+        return out
 
     def _tabs(self, width: int) -> Text:
         lit = self.tab or self.scope
@@ -254,16 +281,19 @@ class FleetScreen(Screen[None], inherit_bindings=False):
                 break
             room -= len(key) + len(title) + 3
             usable = not action.writes or host.unlocked or action.always
+            usable = usable and not lacks(host.view.role, action.role)
             click = Style(meta={"@click": f"app.act('{action.name}')"})
             line.append(f" {key}", Style.parse("bold cyan" if usable else "dim") + click)
             line.append(f" {title} ", (Style() if usable else Style(dim=True)) + click)
         return line
 
-    def _offered(self) -> list[Action]:
-        shown = [action for action in actions.ACTIONS if action.footer]
+    def _offered(self) -> list[Operation]:
+        live = self.host.view.steerable and self.scope != "replay"
+        shown = [action for action in actions.ACTIONS if action.footer and not (action.recorded and live)]
         last = [action for action in shown if not action.screens and action.name in ("help", "stop")]
         ours = [action for action in shown if self.scope in action.screens]
         common = [action for action in shown if not action.screens and action not in last]
+        common.sort(key=lambda action: not action.recorded)
         return [*last, *ours, *common]
 
     def _draw_banner(self, store: Store) -> None:
@@ -291,7 +321,7 @@ class FleetScreen(Screen[None], inherit_bindings=False):
         return {key: thing for key, thing in rows.items() if self.filter.matches(text(key, thing))}
 
     def say(self, which: str, text: Text) -> None:
-        """Show a text in a part of the body, hidden while it is empty; laid out anew only when it has other lines."""
+        """Show a text in a part of the body, hidden while it is empty; laid out again only when its lines change."""
         if self._texts.get(which) == text:
             return
         before, self._texts[which] = self._texts.get(which), text

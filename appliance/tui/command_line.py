@@ -3,14 +3,18 @@
 A filter is a regular expression without regard to case; a leading `!` shows all the others. Pure.
 """
 
+import difflib
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from msgspec import Struct
 
+from appliance.alerts.rules import ordered
 from appliance.errors import SwiftbotError
-from appliance.tui.actions import ACTIONS, Action, Parameter
+from appliance.learn import recipe as recipes
+from appliance.operations import Argument, Operation
+from appliance.tui.actions import ACTIONS
 from appliance.tui.store import Store
 
 LONGEST = 200
@@ -41,7 +45,7 @@ class Filter:
             return
         try:
             with warnings.catch_warnings():
-                # What Python may read otherwise one day is no news to whoever filters a table.
+                # A person who filters a table has no use for warnings about future syntax.
                 warnings.simplefilter("ignore", FutureWarning)
                 self._pattern = re.compile(wanted, re.IGNORECASE)
         except (re.error, RecursionError, OverflowError) as error:
@@ -78,11 +82,11 @@ class UsageError(SwiftbotError):
 
 
 class Command(Struct, frozen=True):
-    """An action with its arguments by kind; `missing` are those that nobody has given."""
+    """An action with its arguments by kind; `missing` are required ones that are not given."""
 
-    action: Action
+    action: Operation
     given: dict[str, str]
-    missing: tuple[Parameter, ...] = ()
+    missing: tuple[Argument, ...] = ()
 
 
 def words(line: str) -> list[str]:
@@ -106,7 +110,7 @@ def words(line: str) -> list[str]:
     return [*found, word] if inside else found
 
 
-def find(name: str, actions: Iterable[Action] = ACTIONS) -> Action:
+def find(name: str, actions: Iterable[Operation] = ACTIONS) -> Operation:
     """Return the action of a name, or of the one name that begins so; UsageError when there is none or several."""
     by_name = {each: action for action in actions for each in (action.name, *action.aliases)}
     if name in by_name:
@@ -116,10 +120,12 @@ def find(name: str, actions: Iterable[Action] = ACTIONS) -> Action:
         return next(iter(found.values()))
     if found:
         raise UsageError(f"`{name[:40]}` may be {', '.join(sorted(found))}", remedy="write more of it")
-    raise UsageError(f"there is no command `{name[:40]}`", remedy="? lists all commands, Tab completes")
+    near = difflib.get_close_matches(name, by_name, n=1)
+    remedy = f"did you mean `{near[0]}`?" if near else "? lists all commands, Tab completes"
+    raise UsageError(f"there is no command `{name[:40]}`", remedy=remedy)
 
 
-def read(line: str, chosen: Mapping[str, str], actions: Iterable[Action] = ACTIONS) -> Command:
+def read(line: str, chosen: Mapping[str, str], actions: Iterable[Operation] = ACTIONS) -> Command:
     """Return what a command line means; arguments that are not written are taken from what is chosen on the screen.
 
     Args:
@@ -149,7 +155,7 @@ def read(line: str, chosen: Mapping[str, str], actions: Iterable[Action] = ACTIO
     return fill(action, given, chosen)
 
 
-def fill(action: Action, given: Mapping[str, str], chosen: Mapping[str, str]) -> Command:
+def fill(action: Operation, given: Mapping[str, str], chosen: Mapping[str, str]) -> Command:
     """Return an action with what was given and, for what must be there, what is chosen on the screen."""
     full = {key: value for key, value in given.items() if value}
     for parameter in action.takes:
@@ -179,21 +185,24 @@ def candidates(kind: str, store: Store, names: Mapping[str, Iterable[str]]) -> l
         store: the fleet.
         names: further names by kind, such as themes.
     """
+    known: Mapping[str, Callable[[], Iterable[str]]] = {
+        "gateway": lambda: sorted(store.gateways),
+        "robot": lambda: sorted(store.robots),
+        "task": lambda: store.newest,
+        "alert": lambda: (each.id for each in ordered(store.alerts.values())),
+        "subtask": lambda: (
+            f"{task}/{each.subtask.id}" for task in store.newest for each in store.tasks[task].subtasks
+        ),
+        "container": lambda: sorted(each.id for each in store.containers.values()),
+        "run": lambda: sorted(store.runs, key=lambda name: -store.runs[name].started_ns),
+        "recipe": recipes.built_in,
+        "robots": lambda: ("all", *sorted(store.robots)),
+        "client": lambda: sorted({each.name for run in store.runs.values() for each in run.clients}),
+        "image": lambda: sorted({plain_image(each.image) for each in store.containers.values()}),
+    }
     if kind in names:
         return list(names[kind])
-    if kind == "gateway":
-        return sorted(store.gateways)
-    if kind == "robot":
-        return sorted(store.robots)
-    if kind == "task":
-        return list(store.newest)
-    if kind == "subtask":
-        return [f"{task}/{each.subtask.id}" for task in store.newest for each in store.tasks[task].subtasks]
-    if kind == "container":
-        return sorted(each.id for each in store.containers.values())
-    if kind == "image":
-        return sorted({plain_image(each.image) for each in store.containers.values()})
-    return []
+    return list(known[kind]()) if kind in known else []
 
 
 def plain_image(reference: str) -> str:
@@ -202,7 +211,7 @@ def plain_image(reference: str) -> str:
 
 
 def complete(
-    line: str, store: Store, names: Mapping[str, Iterable[str]], actions: Iterable[Action] = ACTIONS
+    line: str, store: Store, names: Mapping[str, Iterable[str]], actions: Iterable[Operation] = ACTIONS
 ) -> tuple[str, ...]:
     """Return whole lines that go on from what was typed, at most `MOST_HINTS`."""
     typed = words(line)

@@ -1,6 +1,6 @@
 """Text out of facts: durations, sizes, bars, times, and one line of any message of the plane. Pure.
 
-State is told by a sign and a word (`status_styles`), never by colour alone; foreign text is made safe.
+State is shown by a sign and a word (`status_styles`), never by colour alone; foreign text is made safe.
 
 A line is made of a message when it is drawn, not when it is heard: at thousands of messages a second nearly all are
 never seen. Facts are shown by their fields, everything else as it came, bounded.
@@ -18,6 +18,7 @@ from rich.cells import cell_len
 from rich.text import Text
 
 from appliance.model import Failure
+from appliance.model.keys import fleet_and_rest
 from appliance.tui.safe import safe
 
 Cell = str | tuple[str, str]
@@ -114,14 +115,6 @@ def age(since_ns: int, now_ns: int = 0) -> str:
     return f"{seconds}s"
 
 
-def time_of_day(at_ns: int) -> str:
-    """Return the time of day for people; dashes for none, or one that no calendar has."""
-    try:
-        return datetime.fromtimestamp(at_ns / 1e9).astimezone().strftime("%H:%M:%S") if at_ns > 0 else "--:--:--"
-    except (OverflowError, OSError, ValueError):
-        return "--:--:--"
-
-
 KEPT = 4096
 """Bytes kept of one message: more than a line can show."""
 _LONGEST = 400
@@ -188,10 +181,8 @@ def clock(at_ns: int) -> str:
 
 def _source(key: str) -> tuple[str, str]:
     """Return a key without the fleet's part, and its last word: what it is about."""
-    chunks = key.split("/")
-    if chunks[0] == "swiftbot" and len(chunks) > 2:
-        chunks = chunks[2:]
-    return safe("/".join(chunks), 80), chunks[-1]
+    _, rest = fleet_and_rest(key)
+    return safe(rest, 80), rest.rpartition("/")[2]
 
 
 def _told(kind: str, payload: bytes) -> tuple[str, str]:

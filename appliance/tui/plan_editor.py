@@ -3,7 +3,7 @@
 An operator changes robot, parameters and order of subtasks, or takes some out. Every edit makes a new draft, so undo is
 the draft before. An edit that no gateway could accept (an unknown subtask, a cycle, an empty plan) is refused here at
 once, in words; whether robots can do it is for the gateway's validator, which sees the whole edited plan before it
-counts as checked. The difference is told subtask by subtask and field by field, as text that an operator approves.
+counts as checked. The difference is listed subtask by subtask and field by field, as text that an operator approves.
 
 A line stands below those of what its subtask comes after, indented by the longest chain before it. A record may come
 from a version or a robot that checks nothing, so cycles and unknown predecessors are laid out as well, and no walk
@@ -71,7 +71,7 @@ def _known(subtasks: Iterable[Subtask]) -> dict[str, set[str]]:
 
 
 def branch(depth: int) -> str:
-    """Return what stands before a subtask of that depth."""
+    """Return the indentation of a subtask of that depth."""
     return f"{'   ' * (min(depth, DEEPEST) - 1)}└─▶ " if depth else ""
 
 

@@ -23,7 +23,9 @@ from msgspec import Struct, structs
 
 from appliance.client import FleetClient
 from appliance.errors import PayloadError, RefusedError
-from appliance.model import TaskRecord
+from appliance.model import TaskRecord, keyspace
+from appliance.model.keys import fleet_and_rest
+from appliance.model.roles import Role
 from appliance.plane.session import Closer
 from appliance.record.models import LoggedMessage, LogInfo, compile_expression
 from appliance.record.player import Playhead
@@ -250,7 +252,7 @@ AT_ONCE = 2000
 FAR_S = 20.0
 """Further ahead than this is sought for, instead of hearing everything on the way."""
 GATEWAY_SILENT_S = 8.0
-"""A gateway tells of itself every two seconds, more rarely in large fleets, and then says so."""
+"""A gateway reports every two seconds, more rarely in large fleets, and then says so."""
 ROBOT_SILENT_S = 10.0
 
 _SKIPPED = compile_expression("swiftbot/*/robot/*/camera"), compile_expression("swiftbot/*/robot/*/mavlink/**")
@@ -282,9 +284,8 @@ def fleet_of(about: LogInfo) -> str:
     if name := about.metadata.get("fleet"):
         return name
     for channel in about.channels:
-        chunks = channel.key.split("/")
-        if chunks[0] == "swiftbot" and len(chunks) > 2:
-            return chunks[1]
+        if name := fleet_and_rest(channel.key)[0]:
+            return name
     return "log"
 
 
@@ -293,6 +294,7 @@ class ReplayView:
 
     steerable = False
     operator = ""
+    role: Role | None = None
 
     def __init__(self, cursor: Cursor, config: TuiConfig | None = None) -> None:
         self.config = config or TuiConfig()
@@ -306,7 +308,7 @@ class ReplayView:
         self.reading = False
         """Whether it is being read up to a moment far from the last."""
         self.messages = 0
-        """Messages put into the store since it was last filled anew."""
+        """Messages put into the store since it was last reset."""
         self._cursor = cursor
         self._hearing = Hearing(self.store, self.fleet)
         self._taps: dict[int, tuple[str, Tap]] = {}
@@ -360,9 +362,41 @@ class ReplayView:
     @property
     def orders(self) -> FleetClient:
         """Raise RefusedError: a log takes no orders."""
-        raise RefusedError(
-            "this is a recorded log: nothing can be ordered", remedy="`:live` goes back to the fleet that is there"
-        )
+        raise RefusedError("this is a recorded log: nothing can be ordered", remedy="`:live` goes back to the fleet")
+
+    @property
+    def moment(self) -> str:
+        """Where in the log it is, in words for the header."""
+        now = time.monotonic()
+        state = "‖" if self.head.paused else "▶"
+        at = time.localtime(self.head.position_ns(now) / 1e9)
+        return f"{state} {time.strftime('%Y-%m-%d %H:%M:%S', at)} {self.head.rate:g}x"
+
+    # --- what keys do on every screen ------------------------------------------------------------------------------
+
+    def play(self) -> None:
+        """Play, or pause."""
+        now = time.monotonic()
+        self.head.position_ns(now)  # at the end it stands still
+        if self.head.paused:
+            self.head.play(now)
+        else:
+            self.head.pause(now, paused=True)
+
+    def step(self, seconds: float) -> None:
+        """Go on or back."""
+        now = time.monotonic()
+        self.head.seek(self.head.position_ns(now) + round(seconds * 1e9), now)
+
+    def seek(self, text: str) -> None:
+        """Go to a moment as it is typed; PayloadError when it is none."""
+        now = time.monotonic()
+        seconds = seconds_of(text, at_s=self.head.position_s(now), length_s=self.head.length_s)
+        self.head.seek(self.head.start_ns + round(seconds * 1e9), now)
+
+    def change_rate(self, change: Callable[[float], float]) -> None:
+        """Play faster or slower from now on."""
+        self.head.set_rate(change(self.head.rate), time.monotonic())
 
     def tap(self, expression: str, take: Tap) -> Closer:
         """Have all messages of matching keys delivered as they are played."""
@@ -424,12 +458,11 @@ class ReplayView:
     def _hear(self, message: LoggedMessage) -> None:
         self.messages += 1
         self._hearing.hear(message.key, message.payload, message.at_ns, deleted=message.deleted)
-        chunks = message.key.split("/")
-        if len(chunks) == 5 and not message.deleted:
-            if chunks[2] == "gw" and chunks[4] == "status":
-                self._gateways[chunks[3]] = message.at_ns
-            elif chunks[2] == "robot" and chunks[4] == "state":
-                self._robots[chunks[3]] = message.at_ns
+        if not message.deleted:
+            if (status := keyspace.STATUS.match(message.key)) is not None:
+                self._gateways[status[0]] = message.at_ns
+            elif (state := keyspace.ROBOT.match(message.key)) is not None:
+                self._robots[state[0]] = message.at_ns
         for expression, take in tuple(self._taps.values()):
             if compile_expression(expression).fullmatch(message.key):
                 take(message.key, message.at_ns, message.payload, message.deleted)

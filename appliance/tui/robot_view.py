@@ -1,13 +1,14 @@
 """Robots as rows, sentences and spots of the map, and the map of positions as a widget.
 
-`KnownRobots` keeps all robots with what is known around them, made anew only where something has changed since the last
+`KnownRobots` keeps all robots with what is known around them, updated only where something has changed since the last
 look: with hundreds of robots and a thousand tasks, looking through all of them for each drawing would cost more than
 the drawing itself. `Trails` keeps their last positions, bounded. `Ground` fits the map to its window and asks for the
 site once.
 """
 
+import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import islice
 
 from msgspec import Struct
@@ -80,6 +81,8 @@ class Robot(Struct, frozen=True, kw_only=True):
     """`task/subtask skill` of what it does, empty for nothing."""
     stopped: str = ""
     """Why it is given no commands, in words."""
+    maintenance: str = ""
+    """Who has taken it out of use, why and until when, in words."""
     lease: Lease | None = None
     """Who has taken it over."""
     questions: tuple[Enquiry, ...] = ()
@@ -120,13 +123,13 @@ def questions_of(enquiries: Iterable[Enquiry]) -> dict[str, tuple[Enquiry, ...]]
 
 def link(info: RobotInfo) -> str:
     """Return how it is linked: by its own session, or by a gateway's link."""
-    return info.gateway or "itself"
+    return info.gateway or "direct"
 
 
 def state_cell(robot: Robot) -> tuple[str, str]:
     """Return a robot's state with sign and style, the most urgent first."""
     info = robot.info
-    if not info.online:
+    if not info.online and not robot.maintenance:
         return f"✘ offline {safe(info.note, 80)}".rstrip(), "red"
     if robot.stopped:
         return f"■ {safe(robot.stopped, 80)}", "bold red"
@@ -136,10 +139,10 @@ def state_cell(robot: Robot) -> tuple[str, str]:
         return f"✘ failsafe: {safe(info.failsafe, 80)}", "bold red"
     if robot.lease is not None:
         return f"⇅ {safe(robot.lease.text, 80)}", "magenta"
-    if info.seized:
-        return f"▲ taken: {safe(info.seized, 80)}", "yellow"
-    if info.warnings or info.estimator:
-        return f"▲ {safe(', '.join((*info.warnings, *info.estimator)), 80)}", "yellow"
+    if robot.maintenance:
+        return f"◌ {safe(robot.maintenance, 80)}", "yellow"
+    if told := (f"taken: {info.seized}" if info.seized else ", ".join((*info.warnings, *info.estimator))):
+        return f"▲ {safe(told, 80)}", "yellow"
     words = " ".join(part for part in (f"holds {info.holding}" if info.holding else "", info.note) if part)
     return f"✔ {safe(words, 80) or 'online'}", "green"
 
@@ -183,6 +186,9 @@ def troubles(robot: Robot) -> list[str]:
     if not info.online:
         whom = f"{safe(info.gateway, 63)}'s link to it" if info.gateway else "its own session"
         found.append(f"nothing is heard of it → see that it is on, and {whom} (`swiftbot robots links list`)")
+    if robot.maintenance:
+        name = safe(info.id, 63)
+        found.append(f"{safe(robot.maintenance, 200)} → `swiftbot robots maintain {name} --end` when it may work again")
     if robot.stopped:
         found.append("nothing moves it until it is let go → z or `:resume-robots`, when the way is clear")
     if info.failsafe:
@@ -276,9 +282,10 @@ def areas(site: Site | None) -> list[Area]:
     ]
 
 
-def places(site: Site | None) -> dict[str, tuple[float, float]]:
-    """Return a site's places."""
-    return {name: (each.x, each.y) for name, each in site.places.items()} if site is not None else {}
+def places(site: Site | None, closed: Collection[str] = ()) -> dict[str, tuple[float, float]]:
+    """Return a site's places, by what a map calls them."""
+    known = site.places.items() if site is not None else ()
+    return {f"{name} closed" if name in closed else name: (each.x, each.y) for name, each in known}
 
 
 class KnownRobots:
@@ -291,8 +298,8 @@ class KnownRobots:
     def _forget(self) -> None:
         self._rows: dict[str, Robot] = {}
         self._seen_robots = self._seen_tasks = 0
-        self._seen = (-1, -1, -1)
-        """Revisions of gateways, enquiries and stops."""
+        self._seen: tuple[int, ...] = (-1, -1, -1, -1)
+        """Revisions of gateways, enquiries, stops and closures."""
         self._arrangement = -1
         self._of_task: dict[str, dict[str, str]] = {}
         """Task -> robot -> what it does for it."""
@@ -310,7 +317,7 @@ class KnownRobots:
         self._seen_robots = changes.revision
         stale = set(store.robots) if changes.whole else set(changes.changed)
         stale |= self._follow_tasks(store) | self._follow_around(store)
-        rows = self._rows
+        rows, kept_out = self._rows, store.out_of_use("robot", time.time_ns())
         for name in stale:
             info = store.robots.get(name)
             if info is None:
@@ -321,6 +328,7 @@ class KnownRobots:
                 info=info,
                 mission=next(reversed(doing.values())) if doing else "",
                 stopped=stop.text if stop is not None else "",
+                maintenance=kept_out.get(name, ""),
                 lease=self._leases.get(name),
                 questions=self._questions.get(name, ()),
             )
@@ -357,9 +365,9 @@ class KnownRobots:
         return stale
 
     def _follow_around(self, store: Store) -> set[str]:
-        """Take over leases, questions and stops; robots that are concerned."""
-        gateways, enquiries, stops = self._seen
-        self._seen = store.revision("gateways"), store.revision("enquiries"), store.revision("stops")
+        """Take over leases, questions, stops and closures; robots that are concerned."""
+        gateways, enquiries, *others = self._seen
+        self._seen = store.revisions(("gateways", "enquiries", "stops", "closures"))
         stale: set[str] = set()
         if self._seen[0] != gateways:
             leases = leases_of(store.gateways.values())
@@ -371,7 +379,7 @@ class KnownRobots:
                 robot for robot in asked.keys() | self._questions if asked.get(robot) != self._questions.get(robot)
             }
             self._questions = asked
-        if self._seen[2] != stops:
+        if self._seen[2:] != tuple(others):
             stale.update(store.robots)
         return stale
 
@@ -383,6 +391,7 @@ class Ground(Widget):
         super().__init__(id=id)
         self.trails = Trails()
         self._site: Site | None = None
+        self._closed_places: frozenset[str] = frozenset()
         self._robots: tuple[Robot, ...] = ()
         self._selected = ""
         self._of: View | None = None
@@ -398,6 +407,7 @@ class Ground(Widget):
             # Another fleet, or a recorded log: nobody of it came from there.
             self._of, self.trails = view, Trails()
         self._robots, self._selected = tuple(robots), selected
+        self._closed_places = frozenset(view.store.out_of_use("place", time.time_ns()))
         self.trails.note(each.info for each in self._robots)
         if not self._asked and view.steerable:
             self._asked = True
@@ -428,7 +438,7 @@ class Ground(Widget):
         if columns < 4 or rows < 3:
             return
         shown = spots(self._robots, self.trails, selected=self._selected)
-        known, boxes = places(self._site), areas(self._site)
+        known, boxes = places(self._site, self._closed_places), areas(self._site)
         self._view = view_for(shown, columns, rows, places=known, areas=boxes, before=self._view)
         lines = draw(shown, columns, rows, places=known, areas=boxes, selected=self._selected, view=self._view)
         before, self._lines = self._lines, lines

@@ -5,7 +5,7 @@ used: the script of the page, and the service that runs a Textual program withou
 since it lets everybody in and has the page load a font from elsewhere; the page here speaks to this server and to
 nobody else.
 
-`Guard` decides who is let in: whoever knows the token, from a page of this very server. Loopback alone guards nothing:
+`Guard` decides who is let in: requests with the token, from a page of this very server. Loopback alone guards nothing:
 every user of the machine reaches it, and so does any web page that a browser on it shows, by a request of its own (the
 Origin tells) or by a name that it has made to point at 127.0.0.1 (the Host tells; "DNS rebinding"). All three are
 checked for every request, files included.
@@ -34,7 +34,7 @@ from textual_serve.download_manager import DownloadManager
 from appliance.errors import ConfigError
 
 SHORTEST = 16
-"""Characters of a token that somebody gives: 128 bits if it is drawn well."""
+"""Characters of a given token: 128 bits if it is drawn well."""
 
 
 def make_token() -> str:

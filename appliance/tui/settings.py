@@ -3,6 +3,7 @@
 import os
 import tomllib
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 from msgspec import Struct, field
@@ -24,13 +25,16 @@ class TuiConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reconnect_s: float = 2.0
     """Pause between attempts to connect."""
     silence_s: float = 6.0
-    """Without any gateway for so long, the connection is made anew."""
+    """Seconds without any gateway after which the connection is opened again."""
     ping_s: float = 5.0
     """Pause between rounds in which the latency of each gateway is measured."""
     write: bool = False
     """Start unlocked: what changes the fleet needs no `:write` first."""
     theme: str = "dark"
     """dark, light, blind-dark, blind-light, contrast-dark or contrast-light."""
+    glyphs: Literal["auto", "unicode", "ascii"] = "auto"
+    """Signs that are drawn; `auto`: ASCII on the console of Linux (`TERM=linux`), on a `vt100` and the like, and where
+    the locale is not UTF-8."""
     logs: tuple[str, ...] = ()
     """Further folders in which recorded logs are looked for, for the screen of replay."""
     animation: bool = False

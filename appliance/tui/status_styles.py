@@ -1,4 +1,4 @@
-"""How states look: a glyph, a word and a style for each, so that none is told by colour alone. Pure.
+"""How states look: a glyph, a word and a style for each, so that none depends on colour alone. Pure.
 
 Styles are the names of the terminal's colours used as parts: green is well, yellow works or warns, red is broken, cyan
 is about to be, magenta leaves or was called off, `dim` is past or idle. What each looks like is a matter of the theme
@@ -49,6 +49,24 @@ _CONTAINERS = {
     "draining": Sign("◌", "draining", "magenta"),
     "dead": Sign("✘", "dead", "red"),
 }
+_RUNS = {
+    "running": Sign("●", "running", "yellow"),
+    "paused": Sign("◇", "paused", "cyan"),
+    "succeeded": Sign("✔", "succeeded", "green"),
+    "failed": Sign("✘", "failed", "red"),
+    "stopped": Sign("⊘", "stopped", "magenta"),
+}
+_CLIENTS = {
+    "idle": Sign("·", "idle", "dim"),
+    "waiting": Sign("◔", "waiting", "cyan"),
+    "training": Sign("●", "training", "yellow"),
+    "late": Sign("▲", "late", "yellow"),
+    "done": Sign("✔", "done", "green"),
+    "left out": Sign("✘", "left out", "red"),
+    "absent": Sign("✘", "absent", "red"),
+    "excluded": Sign("⊘", "excluded", "magenta"),
+    "ended": Sign("·", "ended", "dim"),
+}
 _LEVELS = {
     "debug": Sign("·", "debug", "dim"),
     "info": Sign(" ", "info", ""),
@@ -83,6 +101,16 @@ def subtask(state: object) -> Sign:
 def container(state: object) -> Sign:
     """Return the sign of a container's state."""
     return _of(_CONTAINERS, state)
+
+
+def run(state: object) -> Sign:
+    """Return the sign of the state of a run of federated learning."""
+    return _of(_RUNS, state)
+
+
+def client(state: object) -> Sign:
+    """Return the sign of what a client of such a run is at."""
+    return _of(_CLIENTS, state)
 
 
 def level(name: object) -> Sign:

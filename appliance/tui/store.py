@@ -26,8 +26,12 @@ from appliance.model import (
     SoftStop,
     TaskRecord,
 )
+from appliance.model.alerts import Alert
+from appliance.model.closures import Closure
+from appliance.model.learn_api import LearnShown
+from appliance.model.learning import ClientStatus, RoundRecord, RunRecord
+from appliance.model.recorder_api import RecorderStatus
 from appliance.plane.dedup import Deduplicator
-from appliance.record.models import RecorderStatus
 from appliance.robots.authority.soft_stop import Stops
 from appliance.tui.safe import safe
 
@@ -154,9 +158,12 @@ CONTAINERS = 20_000
 RECORDERS = 20
 """Most recorders remembered."""
 RECORDER_SILENT_S = 5.0
-"""A recorder tells of itself every second; without word for so long something is wrong with it."""
+"""A recorder reports every second; silent for so long, it has a problem."""
 SILENT = "silent"
 ENQUIRIES = 200
+ALERTS = 2000
+RUNS = 200
+CLIENTS = 10_000
 LOST_KEPT_S = 3600.0
 """For how long a gateway that went away is still shown, with since when."""
 STARTS = 400
@@ -169,6 +176,11 @@ KINDS = (
     "recorders",
     "enquiries",
     "stops",
+    "alerts",
+    "closures",
+    "runs",
+    "rounds",
+    "clients",
     "entries",
     "starts",
     "connection",
@@ -202,7 +214,7 @@ class Entry(Struct, frozen=True, kw_only=True):
 
 
 class Gateway(Struct, frozen=True, kw_only=True):
-    """A gateway: its last account of itself, and since when it cannot be reached."""
+    """A gateway: its last report, and since when it cannot be reached."""
 
     status: GatewayStatus
     lost_ns: int = 0
@@ -240,6 +252,16 @@ class Store:
         """Questions to people, those that were answered too."""
         self.stops = Stops()
         """Soft stops and their liftings."""
+        self.alerts: Shelf[Alert] = Shelf(ALERTS, age=lambda alert: alert.since_ns)
+        """Alerts of the fleet, by id; one that is over is gone."""
+        self.closures: Shelf[Closure] = Shelf(ALERTS, age=lambda closure: closure.by.at_ns)
+        """Places and robots out of use, by id."""
+        self.runs: Shelf[RunRecord] = Shelf(RUNS, age=lambda run: (not run.state.final, run.started_ns))
+        """Runs of federated learning, by id."""
+        self.rounds: Shelf[RoundRecord] = Shelf(RUNS, age=lambda record: not record.closed)
+        """The open round of each run, or its last, by the run's id."""
+        self.clients: Shelf[ClientStatus] = Shelf(CLIENTS)
+        """What the clients of runs are at, by `run/client`."""
         self.asked: Shelf[object] = Shelf(1000)
         """Answers to what a screen has asked for itself, by a key of its own such as `decisions/gw-1`."""
         self.entries: deque[Entry] = deque(maxlen=entries)
@@ -275,7 +297,7 @@ class Store:
         return tuple(map(self.revision, kinds))
 
     def forget_all(self) -> None:
-        """Begin anew, as when a recorded log is played from another moment."""
+        """Reset, as when a recorded log is played from another moment."""
         for shelf in (
             self.gateways,
             self.containers,
@@ -283,6 +305,11 @@ class Store:
             self.tasks,
             self.recorders,
             self.enquiries,
+            self.alerts,
+            self.closures,
+            self.runs,
+            self.rounds,
+            self.clients,
             self.asked,
         ):
             shelf.clear()
@@ -378,7 +405,7 @@ class Store:
     # --- recorders -------------------------------------------------------------------------------------------------
 
     def take_recorder(self, status: RecorderStatus, now: float) -> None:
-        """Take a recorder's account of itself, heard at `now` (monotonic seconds); one that stopped is forgotten."""
+        """Take a report of a recorder, received at `now` (monotonic seconds); one that stopped is forgotten."""
         if status.state == "stopped":
             self._heard.pop(status.id, None)
             self.recorders.drop(status.id)
@@ -398,6 +425,96 @@ class Store:
         if self.stops.merge(stops, lifted):
             self.stops.forget()
             self._stops_heard += 1
+
+    def take_alert(self, alert: Alert) -> None:
+        """Take an alert as it is now; its acknowledgement is never taken back by an older word."""
+        known = self.alerts.get(alert.id)
+        if alert.cleared_ns:
+            self.alerts.drop(alert.id)
+        elif known is None or alert.changed_ns >= known.changed_ns:
+            self.alerts.put(alert.id, alert)
+
+    def take_closure(self, closure: Closure) -> None:
+        """Take what is out of use, or is in use again; an older word changes nothing."""
+        known = self.closures.get(closure.id)
+        if known is not None and known.by.at_ns > max(closure.by.at_ns, closure.ended_ns):
+            return
+        if closure.ended_ns:
+            self.closures.drop(closure.id)
+        else:
+            self.closures.put(closure.id, closure)
+
+    def take_closures(self, closures: Iterable[Closure], *, known: Iterable[str]) -> None:
+        """Take the answer to a question for all; of those that were known when it was asked, the others are over."""
+        fresh = {each.id: each for each in closures}
+        for name in set(known) - set(fresh):
+            self.closures.drop(name)
+        for each in fresh.values():
+            self.take_closure(each)
+
+    def out_of_use(self, kind: str, now_ns: int) -> dict[str, str]:
+        """Return the places, or robots, that are out of use, and why."""
+        return {each.name: each.text for each in self.closures.values() if each.kind == kind and each.holds(now_ns)}
+
+    def acked(self, alert: str) -> bool:
+        """Whether somebody has acknowledged the alert of an id."""
+        known = self.alerts.get(alert)
+        return known is not None and known.acked is not None
+
+    def take_alerts(self, alerts: Iterable[Alert], *, known: Iterable[str] | None = None) -> None:
+        """Take the answer to a question for all alerts.
+
+        Args:
+            alerts: those there are.
+            known: ids of those that were known when it was asked: of them the others are over. None: all.
+        """
+        fresh = {each.id: each for each in alerts}
+        for name in tuple(self.alerts if known is None else known):
+            if name not in fresh:
+                self.alerts.drop(name)
+        for each in fresh.values():
+            self.take_alert(each)
+
+    # --- federated learning ----------------------------------------------------------------------------------------
+
+    def take_learn_run(self, run: RunRecord) -> None:
+        """Take a run's record unless a later one is known; of those that go their clients are forgotten."""
+        known = self.runs.get(run.id)
+        if known is not None and (known.updated_ns, known.round) > (run.updated_ns, run.round):
+            return
+        self.runs.put(run.id, run)
+        if len(self.clients) > CLIENTS // 2:
+            for key in [key for key, each in self.clients.items() if each.run not in self.runs]:
+                self.clients.drop(key)
+
+    def forget_learn_run(self, run: str) -> None:
+        """Forget a run that was removed."""
+        self.runs.drop(run)
+        self.rounds.drop(run)
+        for key in [key for key in self.clients if key.startswith(f"{run}/")]:
+            self.clients.drop(key)
+
+    def take_shown(self, shown: LearnShown) -> None:
+        """Take the answer to a question for one run."""
+        self.take_learn_run(shown.run)
+        if shown.round is not None:
+            names = {"coordinator": shown.coordinator, "successor": shown.successor, "elapsed_s": shown.elapsed_s}
+            self.take_round(structs.replace(shown.round, **names))
+        for each in shown.clients:
+            self.take_client(each)
+
+    def take_round(self, record: RoundRecord) -> None:
+        """Take a round's record unless one of a later round is known, or that it is closed."""
+        known = self.rounds.get(record.run)
+        if known is None or (known.number, known.closed) <= (record.number, record.closed):
+            self.rounds.put(record.run, record)
+
+    def take_client(self, status: ClientStatus) -> None:
+        """Take what a client is at unless it is of a round before."""
+        key = f"{status.run}/{status.client}"
+        known = self.clients.get(key)
+        if known is None or known.round <= status.round:
+            self.clients.put(key, status)
 
     # --- the log ---------------------------------------------------------------------------------------------------
 

@@ -32,23 +32,29 @@ from appliance.model import (
     RunEvent,
     SoftStop,
     TaskRecord,
+    keyspace,
 )
-from appliance.plane.keys import Keys
-from appliance.plane.node import Member, MemberAsk, PlaneClient
+from appliance.model.alerts import Alert
+from appliance.model.closures import Closure
+from appliance.model.keys import Keys, Topic
+from appliance.model.learning import ClientStatus, RoundRecord, RunRecord
+from appliance.model.plane_api import MemberAsk
+from appliance.model.recorder_api import RecorderStatus
+from appliance.model.roles import Role
+from appliance.plane.client import PlaneClient
+from appliance.plane.events import FactsChanged, FleetEvent, Stage
 from appliance.plane.session import Closer
 from appliance.plane.settings import PlaneConfig
-from appliance.record.models import RecorderStatus
 from appliance.tui.settings import TuiConfig
-from appliance.tui.store import Connection, Gateway, Store
+from appliance.tui.store import RUNS, Connection, Gateway, Store
 
 Take = Callable[[str, Any], None]
 
 
 class Door(Struct, frozen=True):
-    """Keys of one kind: the expression that matches them, what they carry, and who takes it (None: deleted)."""
+    """A topic, and who takes what is put there (None: deleted)."""
 
-    expr: str
-    kind: type[Any]
+    topic: Topic[Any]
     take: Take
 
 
@@ -64,28 +70,33 @@ class Hearing:
         self.refused: dict[str, int] = {}
         """Messages that could not be decoded, by kind."""
         self._store = store
-        keys = Keys(fleet)
+        self._root = f"{Keys(fleet).root}/"
         self.events: tuple[Door, ...] = (
-            Door(keys.task(), TaskRecord, self._task),
-            Door(keys.run(), RunEvent, self._run),
-            Door(keys.notice(), Notice, self._notice),
-            Door(keys.log(), LogLine, self._log),
-            Door(keys.recorder_status(), RecorderStatus, self._recorder),
-            Door(keys.act(), Act, self._act),
-            Door(keys.enquiry(), Enquiry, self._enquiry),
-            Door(keys.soft_stop(), SoftStop, self._stop),
-            Door(keys.lifted(), Lifted, self._lift),
+            Door(keyspace.TASK_UPDATE, self._task),
+            Door(keyspace.RUN_EVENT, self._run),
+            Door(keyspace.NOTICE, self._notice),
+            Door(keyspace.LOG, self._log),
+            Door(keyspace.RECORDER_STATUS, self._recorder),
+            Door(keyspace.ACT, self._act),
+            Door(keyspace.ENQUIRY, self._enquiry),
+            Door(keyspace.STOP, self._stop),
+            Door(keyspace.LIFTED, self._lift),
+            Door(keyspace.ALERT, self._alert),
+            Door(keyspace.CLOSURE, self._closure),
+            Door(keyspace.LEARN_RUN, self._learn_run),
+            Door(keyspace.LEARN_ROUND, self._round),
+            Door(keyspace.LEARN_CLIENT, self._client),
         )
-        """What nobody but us keeps the latest of."""
+        """Keys whose latest value is kept here only."""
         self.facts: tuple[Door, ...] = (
-            Door(keys.status(), GatewayStatus, self._status),
-            Door(keys.container(), ContainerInfo, self._container),
-            Door(keys.robot(), RobotInfo, self._robot),
+            Door(keyspace.STATUS, self._status),
+            Door(keyspace.CONTAINER, self._container),
+            Door(keyspace.ROBOT, self._robot),
         )
         """What a live view takes from the plane's registry instead, which knows of membership too."""
-        self._doors = [
-            (door.expr.split("/"), door, msgspec.json.Decoder(door.kind)) for door in (*self.events, *self.facts)
-        ]
+        self._doors = {
+            door.topic: (door.take, msgspec.json.Decoder(door.topic.payload)) for door in (*self.events, *self.facts)
+        }
 
     def hear(self, key: str, payload: bytes, at_ns: int, *, deleted: bool = False) -> bool:
         """Take one message; whether it was for the store. What cannot be decoded is counted in `refused`.
@@ -96,31 +107,28 @@ class Hearing:
             at_ns: when, Unix nanoseconds.
             deleted: whether the key was deleted instead.
         """
-        parts = key.split("/")
-        for pattern, door, decoder in self._doors:
-            if len(pattern) != len(parts) or any(
-                each not in ("*", part) for each, part in zip(pattern, parts, strict=True)
-            ):
-                continue
-            self._at_ns = at_ns
-            if deleted:
-                door.take(key, None)
-                return True
-            try:
-                value = decoder.decode(payload)
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-                name = door.kind.__name__
-                self.refused[name] = self.refused.get(name, 0) + 1
-                return False
-            door.take(key, value)
+        topic = keyspace.topic_of(key)
+        if topic is None or not key.startswith(self._root) or (found := self._doors.get(topic)) is None:
+            return False
+        take, decoder = found
+        self._at_ns = at_ns
+        if deleted:
+            take(key, None)
             return True
-        return False
+        try:
+            value = decoder.decode(payload)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            name = topic.payload.__name__
+            self.refused[name] = self.refused.get(name, 0) + 1
+            return False
+        take(key, value)
+        return True
 
     _at_ns = 0
 
     def _task(self, key: str, record: TaskRecord | None) -> None:
         if record is None:
-            self._store.forget_task(key.split("/")[-2])
+            self._store.forget_task(*keyspace.TASK_UPDATE.names(key))
         else:
             self._store.take_task(record)
 
@@ -135,7 +143,7 @@ class Hearing:
     def _log(self, key: str, line: LogLine | None) -> None:
         if line is not None:
             # Whose log it is the key says; a line's own source may be another gateway that it is about, or nobody.
-            self._store.take_log(structs.replace(line, source=key.split("/")[-2]))
+            self._store.take_log(structs.replace(line, source=keyspace.LOG.names(key)[0]))
 
     def _act(self, _key: str, act: Act | None) -> None:
         if act is not None:
@@ -149,9 +157,29 @@ class Hearing:
         if lifted is not None:
             self._store.take_stops((), (lifted,))
 
+    def _alert(self, _key: str, alert: Alert | None) -> None:
+        if alert is not None:
+            self._store.take_alert(alert)
+
+    def _closure(self, _key: str, closure: Closure | None) -> None:
+        if closure is not None:
+            self._store.take_closure(closure)
+
+    def _learn_run(self, _key: str, run: RunRecord | None) -> None:
+        if run is not None:
+            self._store.take_learn_run(run)
+
+    def _round(self, _key: str, record: RoundRecord | None) -> None:
+        if record is not None:
+            self._store.take_round(record)
+
+    def _client(self, _key: str, status: ClientStatus | None) -> None:
+        if status is not None:
+            self._store.take_client(status)
+
     def _enquiry(self, key: str, enquiry: Enquiry | None) -> None:
         if enquiry is None:
-            self._store.enquiries.drop(key.rsplit("/", maxsplit=1)[-1])
+            self._store.enquiries.drop(*keyspace.ENQUIRY.names(key))
         else:
             self._store.enquiries.put(enquiry.id, enquiry)
 
@@ -160,7 +188,7 @@ class Hearing:
             self._store.take_recorder(status, time.monotonic())
 
     def _status(self, key: str, status: GatewayStatus | None) -> None:
-        name = key.split("/")[-2]
+        (name,) = keyspace.STATUS.names(key)
         if status is None:
             self._store.gateways.drop(name)
             return
@@ -169,14 +197,14 @@ class Hearing:
         self._store.gateways.put(name, fresh)
 
     def _container(self, key: str, info: ContainerInfo | None) -> None:
-        name = "/".join(key.split("/")[-3::2])
+        name = "/".join(keyspace.CONTAINER.names(key))
         if info is None or info.state is ContainerState.DEAD:
             self._store.containers.drop(name)
         else:
             self._store.containers.put(name, info)
 
     def _robot(self, key: str, info: RobotInfo | None) -> None:
-        name = key.split("/")[-2]
+        (name,) = keyspace.ROBOT.names(key)
         if info is None:
             self._store.robots.drop(name)
         else:
@@ -187,6 +215,8 @@ log = structlog.get_logger(__name__)
 
 _WATCH_S = 0.5
 _PING_TIMEOUT_S = 1.0
+MOST_ASKED_RUNS = 8
+"""Of those that go on: so many are asked for whole each time."""
 _PINGS = 10
 """Gateways whose latency is measured a second at most."""
 
@@ -198,8 +228,15 @@ class View(Protocol):
     store: Store
     operator: str
     """Who gives the orders, for the audit."""
+    role: Role | None
+    """What the operator's certificate allows; None without keys."""
     steerable: bool
     """False where nothing can be ordered, as in a recorded log."""
+
+    @property
+    def moment(self) -> str:
+        """Where in a recorded log it is, in words; empty for a fleet as it is now."""
+        ...
 
     async def start(self) -> None:
         """Begin to listen, and keep connected; returns at once."""
@@ -229,11 +266,13 @@ class FleetView:
     """
 
     steerable = True
+    moment = ""
 
     def __init__(self, plane_config: PlaneConfig, fleet: str, config: TuiConfig | None = None) -> None:
         self.fleet = fleet
         self.config = config or TuiConfig()
         self.operator = operator_name()
+        self.role: Role | None = None
         self.store = Store(tasks=self.config.tasks, entries=self.config.entries)
         self._hearing = Hearing(self.store, fleet)
         self._plane_config = plane_config
@@ -296,12 +335,13 @@ class FleetView:
 
     async def _keep_once(self) -> None:
         """One connection from its opening to its end."""
-        endpoint = Endpoint(fleet=self.fleet, connect=self._plane_config.connect)
+        endpoint = Endpoint(fleet=self.fleet, connect=self._plane_config.connect, keys=self._plane_config.keys)
         client = FleetClient(endpoint, operator=self.operator, plane=self._plane_config)
         await client.open()
         try:
             self._listen(client.plane)
             self._client = client
+            self.role = client.role
             self._dirty |= {"gateway", "container", "robot"}
             pinging = asyncio.create_task(self._keep_pinging(client.plane), name="latencies")
             try:
@@ -315,16 +355,15 @@ class FleetView:
 
     def _listen(self, plane: PlaneClient) -> None:
         # They end with the session; kept because a subscription may end with its handle.
-        self._closers = [
-            plane.session.subscribe_typed(door.expr, door.kind, door.take) for door in self._hearing.events
-        ]
-        plane.registry.on_change.append(self._dirty_now)
+        self._closers = [plane.session.subscribe_typed(door.topic, door.take) for door in self._hearing.events]
+        plane.events.subscribe(Stage.WATCHERS, self._on_event)
 
-    def _dirty_now(self, what: str) -> None:
-        self._dirty.add(what)
+    def _on_event(self, event: FleetEvent) -> None:
+        if isinstance(event, FactsChanged):
+            self._dirty.add(event.kind)
 
     async def _watch(self, plane: PlaneClient) -> None:
-        """Watch over one connection; returns when it is to be made anew."""
+        """Watch over one connection; returns when it must be opened again."""
         silent_since = time.monotonic()
         asked_at = float("-inf")
         members: frozenset[str] = frozenset()
@@ -335,6 +374,9 @@ class FleetView:
                 # Gateways came or went, perhaps the one that this connection hung on: pushes may have been missed.
                 members = plane.members()
                 asked_at = float("-inf")
+                self._take_arcs(plane)
+            elif any(each.arc is None and not each.lost_ns for each in self.store.gateways.values()):
+                # A gateway that has come back: its token was seen before its account of itself.
                 self._take_arcs(plane)
             if members:
                 silent_since = now
@@ -359,18 +401,50 @@ class FleetView:
             return
         self.store.take_tasks(answer.tasks)
         await self._ask_standing()
+        try:
+            await self._ask_runs()
+        except SwiftbotError as error:
+            self._say(f"runs of federated learning: {error}")
         if answer.unreachable:
             self._say(f"task list is without {', '.join(answer.unreachable)}: no answer")
 
     async def _ask_standing(self) -> None:
-        """Ask for soft stops, and the questions that wait; others were answered or closed unheard."""
-        try:
-            answer = await self.orders.enquiries()
-            standing = await self.orders.standing()
-        except SwiftbotError as error:
-            self._say(f"what waits for operators: {error}")
-            return
+        """Ask for soft stops, alerts, what is out of use, and questions: one that is not answered hides no other."""
+        for ask in (self._ask_stops, self._ask_alerts, self._ask_questions, self._ask_closures):
+            try:
+                await ask()
+            except SwiftbotError as error:
+                self._say(f"what waits for operators: {error}")
+
+    async def _ask_stops(self) -> None:
+        standing = await self.orders.standing()
         self.store.take_stops(standing.stops, standing.lifted)
+
+    async def _ask_alerts(self) -> None:
+        known = tuple(self.store.alerts)
+        answer = await self.orders.alerts()
+        # Of gateways that did not answer nothing is known to be over.
+        self.store.take_alerts(answer.alerts, known=() if answer.unreachable else known)
+
+    async def _ask_closures(self) -> None:
+        known = tuple(self.store.closures)
+        self.store.take_closures((await self.orders.closures()).closures, known=known)
+
+    async def _ask_runs(self) -> None:
+        """Ask for the runs of federated learning, and for what the clients of those that go on are at."""
+        known = tuple(self.store.runs)
+        runs, failed = await self.orders.learn_runs()
+        for name in known:
+            if not failed and name not in {run.id for run in runs}:
+                self.store.forget_learn_run(name)
+        for run in runs[:RUNS]:
+            self.store.take_learn_run(run)
+        for run in [run for run in runs if not run.state.final][:MOST_ASKED_RUNS]:
+            self.store.take_shown(await self.orders.learn_show(run.id))
+
+    async def _ask_questions(self) -> None:
+        """Others were answered or closed unheard."""
+        answer = await self.orders.enquiries()
         waiting = {each.id for each in answer.enquiries}
         for name in [name for name, each in self.store.enquiries.items() if each.open and name not in waiting]:
             self.store.enquiries.drop(name)
@@ -385,7 +459,7 @@ class FleetView:
         self.store.take_task(record)
 
     def _remedy(self) -> str:
-        return "start one with `swiftbot gateway`, or name its endpoint with --connect; trying again by itself"
+        return "start one with `swiftbot gateway`, or name its endpoint with --connect; reconnecting automatically"
 
     # --- what is measured from here ------------------------------------------------------------------------
 
@@ -400,7 +474,7 @@ class FleetView:
             for name in sorted(plane.members()):
                 began = time.monotonic()
                 with contextlib.suppress(SwiftbotError):
-                    await plane.rpc.call(name, "member", MemberAsk(gateway=name), Member, timeout_s=_PING_TIMEOUT_S)
+                    await plane.rpc.call(name, keyspace.MEMBER, MemberAsk(gateway=name), timeout_s=_PING_TIMEOUT_S)
                     self.store.measured(name, latency_ms=1e3 * (time.monotonic() - began))
                 await asyncio.sleep(1 / _PINGS)
             await asyncio.sleep(self.config.ping_s)

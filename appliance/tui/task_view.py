@@ -11,7 +11,8 @@ from msgspec import Struct
 from rich.text import Text
 
 from appliance.model import PLAIN_PRIORITY, Proposal, SubtaskRecord, SubtaskState, TaskRecord, TaskState
-from appliance.tasks.views import AttemptWhy, SubtaskWhy, TaskWhy, Waits
+from appliance.model.task_api import AttemptWhy, SubtaskWhy, TaskWhy, Waits
+from appliance.tasks.views import status
 from appliance.tui import plan_editor, status_styles
 from appliance.tui.formatting import Cell, bar, clock, duration, hanging, milliseconds, told
 from appliance.tui.plan_editor import params_text
@@ -26,6 +27,8 @@ def state_cell(record: TaskRecord) -> tuple[str, str]:
         return "‖ paused", "magenta"
     if waits(record) is not None:
         return "? approve", "bold yellow"
+    if status(record) == "blocked":
+        return "▲ blocked", "yellow"
     sign = status_styles.task(record.state)
     return sign.text, sign.style
 

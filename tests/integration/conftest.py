@@ -14,6 +14,15 @@ from appliance.pool import images
 from appliance.pool.engine import remove_fleet, socket_path
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
+HERE = Path(__file__).parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what lies here as `fleet`: real processes, links and deadlines."""
+    for item in items:
+        if HERE in item.path.parents:
+            item.add_marker(pytest.mark.fleet)
+
 
 @pytest.fixture(scope="module")
 def podman() -> Path:
@@ -44,7 +53,7 @@ def probe() -> tuple[str, str]:
 
 @pytest.fixture
 def catalogue(folder: Path, probe: tuple[str, str]) -> Catalogue:
-    """Return the real catalogue with one skill more, which does what it is told."""
+    """Return the real catalogue with one skill more, which does what its parameters say."""
     return load_catalogue([write_probe(folder, *probe)])
 
 
@@ -52,7 +61,7 @@ def catalogue(folder: Path, probe: tuple[str, str]) -> Catalogue:
 async def built(podman: Path) -> None:
     """Build the images that are missing."""
     catalogue = load_catalogue()
-    for name in catalogue.images:
+    for name in (name for name, spec in catalogue.images.items() if not spec.on_demand):
         await images.build(name, catalogue)
 
 

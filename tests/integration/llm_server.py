@@ -1,4 +1,4 @@
-"""A real HTTP server that speaks as the upstream tier expects, or misbehaves as it is told."""
+"""A real HTTP server that speaks as the upstream tier expects, or misbehaves on request."""
 
 import json
 import threading
@@ -31,7 +31,7 @@ def completion(content: Any, **more: Any) -> tuple[int, bytes]:
 
 
 class Server:
-    """An OpenAI-compatible server that answers as it is told, in order; the last answer stays."""
+    """An OpenAI-compatible server that answers as prepared, in order; the last answer stays."""
 
     def __init__(self) -> None:
         self.answers: list[Answer | Callable[[dict[str, Any]], Answer]] = []

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from appliance.plane.node import Plane
+from appliance.plane.records import Resolver, by_bytes
 from appliance.plane.settings import PlaneConfig
 
 
@@ -27,11 +28,13 @@ class Fleet:
         self.settings = settings
         self.planes: dict[int, Plane] = {}
 
-    async def start(self, number: int) -> Plane:
+    async def start(self, number: int, resolver: Resolver = by_bytes) -> Plane:
         """Start one gateway."""
         peers = {f"g{each}": endpoint for each, endpoint in enumerate(self.endpoints)}
         config = msgspec.convert({"listen": (self.endpoints[number],), "peers": peers, **self.settings}, PlaneConfig)
-        plane = await Plane.open(config, fleet="f", gateway=f"g{number}", data_dir=self.folder / f"g{number}")
+        plane = await Plane.open(
+            config, fleet="f", gateway=f"g{number}", data_dir=self.folder / f"g{number}", resolver=resolver
+        )
         self.planes[number] = plane
         return plane
 

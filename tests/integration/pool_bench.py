@@ -1,4 +1,4 @@
-"""Pools on real Podman for tests: a fleet of the test's own, with one skill that does what it is told."""
+"""Pools on real Podman for tests: a fleet of the test's own, with one skill that does what its parameters say."""
 
 import asyncio
 import secrets
@@ -13,11 +13,11 @@ from appliance.pool.pool import Call, Pool
 from appliance.pool.pressure import Reading
 from appliance.pool.selection import Candidate
 from appliance.pool.settings import PoolConfig
-from appliance.pool.state import ALONE, State
+from appliance.pool.volumes import ALONE, State
 from appliance.skills.catalogue import Catalogue
 
 HANDLER = """
-import os, socket, time
+import ctypes, errno, os, socket, subprocess, threading, time
 from pathlib import Path
 
 def attempt(work):
@@ -46,6 +46,29 @@ def run(ctx):
     if do == "look":
         return {"files": sorted(os.listdir("/tmp") + os.listdir("/dev/shm")),
                 "processes": sorted(int(each) for each in os.listdir("/proc") if each.isdigit()), "me": os.getpid()}
+    if do == "kernel":
+        libc = ctypes.CDLL(None, use_errno=True)
+        def ask(call):
+            def child():
+                ctypes.set_errno(0)
+                return 0 if call() >= 0 else ctypes.get_errno()
+            pid = os.fork()  # what works changes only the child
+            if pid == 0:
+                os._exit(child())
+            return errno.errorcode.get(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), "done")
+        thread = threading.Thread(target=lambda: None)
+        thread.start()
+        thread.join()
+        return {
+            "user namespace": ask(lambda: libc.unshare(0x10000000)),
+            "mount": ask(lambda: libc.mount(b"none", b"/tmp", b"tmpfs", 0, None)),
+            "ptrace": ask(lambda: libc.ptrace(0, 0, 0, 0)),
+            "clone into a namespace": ask(lambda: libc.syscall(56, 0x10000000 | 17, 0, 0, 0, 0)),
+            "clone3": ask(lambda: libc.syscall(435, None, 0)),
+            "io_uring": ask(lambda: libc.syscall(425, 1, bytes(120))),
+            "keyctl": ask(lambda: libc.syscall(250, 0, -3, 1)),
+            "program": subprocess.run(["/bin/true"]).returncode,
+        }
     if do == "harden":
         lines = Path("/proc/self/status").read_text().splitlines()
         status = dict(line.split(":\\t", 1) for line in lines if ":\\t" in line)

@@ -10,7 +10,7 @@ from appliance.plane.settings import PlaneConfig
 
 
 class Relay:
-    """Passes bytes between whoever connects and a port, until it is cut; then nothing, until it is mended."""
+    """Passes bytes between its clients and a port, until it is cut; then nothing, until it is mended."""
 
     def __init__(self, port: int, to: int) -> None:
         self._port, self._to = port, to

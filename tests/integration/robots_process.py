@@ -16,11 +16,11 @@ from msgspec.structs import replace
 from appliance.client import FleetClient
 from appliance.connection import FleetState
 from appliance.model import RobotInfo
+from appliance.model.robot_api import LinkAdd, LinkFacts, MavlinkLink
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
-from appliance.robots.api import LinkAdd, LinkFacts
 from appliance.robots.mavlink.dialect import Codec, make
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import RobotsConfig
 
 BEAT = {"type": 2, "autopilot": 3, "base_mode": 0, "custom_mode": 4, "system_status": 4, "mavlink_version": 3}
 STATION = BEAT | {"type": 6, "autopilot": 8}

@@ -14,11 +14,11 @@ from typing import Any
 
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
-from appliance.pool.engine import PodmanStorage, remove_fleet
+from appliance.pool.engine import PodmanEngine, remove_fleet
 from appliance.pool.settings import TransferConfig
-from appliance.pool.transfer.transfers import Transfers
-from appliance.pool.volume_store import podman_name
-from appliance.pool.volumes import Volumes
+from appliance.pool.volumes.registry import Volumes
+from appliance.pool.volumes.store import podman_name
+from appliance.pool.volumes.transfers import Transfers
 
 MIB = 2**20
 
@@ -26,9 +26,7 @@ MIB = 2**20
 class Side:
     """One gateway's plane, volumes and transfers."""
 
-    def __init__(
-        self, plane: Plane, volumes: Volumes, transfers: Transfers, storage: PodmanStorage, fleet: str
-    ) -> None:
+    def __init__(self, plane: Plane, volumes: Volumes, transfers: Transfers, storage: PodmanEngine, fleet: str) -> None:
         self.plane, self.volumes, self.transfers, self.storage, self.fleet = plane, volumes, transfers, storage, fleet
 
     async def folder(self, name: str) -> Path:
@@ -96,7 +94,7 @@ async def open_side(
     plane = await Plane.open(
         PlaneConfig(listen=(listen,), connect=connect), fleet=fleet, gateway=gateway, data_dir=folder
     )
-    storage = PodmanStorage(podman)
+    storage = PodmanEngine.for_transfers(podman)
     volumes = Volumes(config, fleet=fleet, gateway=gateway, store=plane.store, records=plane.dht, storage=storage)
     transfers = Transfers(config, plane=plane, volumes=volumes, storage=storage, data_dir=folder)
     await volumes.start()

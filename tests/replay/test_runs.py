@@ -1,7 +1,7 @@
 """Recorded runs of real fleets: today's deciders must decide as they did then, and the terminal UI must show it.
 
 `logs/runs/` has a normal run, one whose gateways were killed, one that was cut in two and healed, and one whose gateway
-was short of memory and gave its runs away; `scripts/record_replay_logs.sh` records them anew. docs/replay.md says how
+was short of memory and gave its runs away; `scripts/record_replay_logs.sh` records them again. docs/replay.md says how
 an incident becomes such a test.
 """
 
@@ -12,8 +12,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from appliance.learn.decisions import all_traced
 from appliance.model import ContainerInfo, ContainerState, TaskRecord
-from appliance.plane.keys import Keys
+from appliance.model.keys import Keys
 from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
 from appliance.tasks.replay import CheckReport, check
@@ -40,7 +41,7 @@ def messages(name: str) -> tuple[LoggedMessage, ...]:
 @cache
 def report(name: str) -> CheckReport:
     """Return what comes of making its decisions again."""
-    return check([LOGS / name])
+    return check([LOGS / name], traced=all_traced())
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -56,7 +57,7 @@ def test_every_decision_comes_out_as_it_was(name: str) -> None:
 def test_the_log_shows_what_its_name_says(name: str) -> None:
     """A run of a killed gateway has takeovers, a partition heals, overload moves runs; nothing ends in failure.
 
-    That a task has ended may be told by nobody: whoever would have was killed.
+    That a task has ended may be published by nobody: its coordinator was killed.
     """
     kinds: Counter[str] = Counter()
     ends: dict[str, str] = {}

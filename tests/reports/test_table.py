@@ -11,7 +11,7 @@ import pytest
 SOURCE = re.compile(r"[A-Za-z0-9][A-Za-z0-9-]*/[A-Za-z0-9._-]+#[1-9][0-9]*")
 FIELDS = {"source", "title", "fault", "input", "right", "test"}
 MODULES = (
-    "tests/integration/test_reports.py",
+    "tests/integration/robots/test_reports.py",
     "tests/unit/pool/test_reported_runs.py",
     "tests/unit/record/test_reported_logs.py",
     "tests/unit/robots/test_reported_commands.py",
@@ -82,7 +82,7 @@ def test_each_test_of_a_report_names_one(project_root: Path) -> None:
 def test_every_surface_is_tried(reports: list[dict[str, str]]) -> None:
     """Of each area so many at least, and so many of all by a real process."""
     by = Counter(row["test"].split("::")[0] for row in reports)
-    process = by["tests/integration/test_reports.py"]
+    process = by["tests/integration/robots/test_reports.py"]
     zenoh = sum("zenoh" in row["source"] for row in reports)
     assert process >= 20
     assert zenoh >= 8

@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance import cli
-from appliance.cli import plan, steer, task
+from appliance.cli import common, submit
 from appliance.client import Named, named
 from appliance.errors import UnreachableError
 from appliance.model import (
@@ -26,8 +26,8 @@ from appliance.model import (
     TaskRequest,
     TaskState,
 )
-from appliance.robots.api import StopAnswer
-from appliance.tasks.api import PlanAnswer, PlanChecked
+from appliance.model.robot_api import StopAnswer
+from appliance.model.task_api import PlanAnswer, PlanChecked
 
 ROSTER = ("rover_1", "rover_2", "drone_1")
 PLAN = Plan(domain="inspection", subtasks=(Subtask(id="s1", skill="goto", robot="rover_1", params={"place": "dock"}),))
@@ -132,8 +132,7 @@ class Fleet:
 def fleet(monkeypatch: pytest.MonkeyPatch) -> Fleet:
     """Return the fleet that every command connects to."""
     made = Fleet()
-    for module in (steer, task, plan):
-        monkeypatch.setattr(module, "FleetClient", lambda _: made)
+    monkeypatch.setattr(common, "FleetClient", lambda _: made)
     return made
 
 
@@ -296,8 +295,8 @@ def test_without_wait_it_is_shown_too(fleet: Fleet, swiftbot: Any) -> None:
 def terminal(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return the answers that a person at the terminal will give."""
     answers: list[str] = []
-    monkeypatch.setattr(task, "on_terminal", lambda: True)
-    monkeypatch.setattr(task.console.out, "input", lambda _, **__: answers.pop(0))
+    monkeypatch.setattr(submit, "on_terminal", lambda: True)
+    monkeypatch.setattr(submit.console.out, "input", lambda _, **__: answers.pop(0))
     return answers
 
 

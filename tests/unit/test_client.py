@@ -7,6 +7,7 @@ import pytest
 from appliance.client import Endpoint, FleetClient
 from appliance.errors import DeadlineError, UnreachableError
 from appliance.model import TaskRecord, TaskRequest
+from appliance.model.keys import Verb
 
 pytestmark = pytest.mark.anyio
 
@@ -28,12 +29,12 @@ class Wire:
         """The first that is not to be avoided."""
         return (sorted(self.members() - avoid) or sorted(self.members()))[0]
 
-    async def call(self, gateway: str, verb: str, request: Any, reply: Any, *, timeout_s: float) -> Any:
+    async def call(self, gateway: str, verb: Verb[Any, Any], request: Any, *, timeout_s: float | None) -> Any:
         """Answer, or not."""
-        del reply, timeout_s
+        del timeout_s
         self.asked.append((gateway, request.id))
         if gateway in self.silent:
-            raise DeadlineError(f"{gateway} did not answer {verb}")
+            raise DeadlineError(f"{gateway} did not answer {verb.name}")
         if gateway in self.gone:
             raise UnreachableError(f"{gateway} is gone")
         return TaskRecord(id=request.id, instruction=request.instruction)

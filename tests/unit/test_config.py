@@ -9,9 +9,10 @@ import pytest
 from appliance import config
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError
+from appliance.model.robot_api import MavlinkLink
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import RobotsConfig
 
 
 def write(path: Path, text: str) -> Path:
@@ -63,7 +64,9 @@ def test_what_is_written_reads_back_the_same(tmp_path: Path) -> None:
         data_dir='/tmp/with "quotes" and \\ backslash',
         skills=("/a", "/b"),
         plane=PlaneConfig(
-            listen=("tcp/127.0.0.1:7447",), peers={"gw-7": "tcp/10.0.0.7:7447", "gw-8.west": "tcp/10.0.0.8:7447"}
+            listen=("tls/127.0.0.1:7447",),
+            keys="/etc/keys.pem",
+            peers={"gw-7": "tls/10.0.0.7:7447", "gw-8.west": "tls/10.0.0.8:7447"},
         ),
         pool=PoolConfig(floor={"base": 3}, mode="local"),
         robots=RobotsConfig(mavlink=(MavlinkLink(names={"1": "drone_1"}),)),
@@ -98,3 +101,12 @@ def test_the_documentation_lists_every_key(project_root: Path) -> None:
         [sys.executable, str(project_root / "scripts" / "write_configuration.py"), "--check"], check=False
     )
     assert done.returncode == 0, "run scripts/write_configuration.py"
+
+
+def test_with_keys_mavlink_links_that_others_reach_are_signed(tmp_path: Path) -> None:
+    """A file that leaves one open is refused with the link's address; the same without keys is not."""
+    keys = '[plane]\nkeys = "/etc/swiftbot/keys/gateway-gw-1.pem"\n'
+    robots = '[robots]\nmavlink = [{ listen = "udp://0.0.0.0:14550" }]\n'
+    with pytest.raises(ConfigError, match=r"udp://0.0.0.0:14550 is not signed"):
+        config.load(write(tmp_path / "g.toml", f'id = "gw-1"\n{keys}{robots}'))
+    config.load(write(tmp_path / "g.toml", f'id = "gw-1"\n{robots}'))

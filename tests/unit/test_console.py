@@ -22,9 +22,10 @@ from appliance.model import (
     Way,
     encode,
 )
-from appliance.pool.api import Evicted, PoolDecision
+from appliance.model.pool_api import Evicted, PoolDecision
+from appliance.model.task_api import TaskWhy
 from appliance.reasons import why_text
-from appliance.tasks.views import TaskWhy, view, why
+from appliance.tasks.views import view, why
 
 CHOICE = Choice(
     phase=Phase.REMOTE_WARM,

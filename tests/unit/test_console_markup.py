@@ -4,7 +4,7 @@ import types
 from collections.abc import Callable, Mapping
 from enum import Enum
 from io import StringIO
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import msgspec
 import pytest
@@ -14,11 +14,10 @@ from msgspec import Struct
 from rich.text import Text
 
 from appliance import cli, console, reasons
-from appliance.cli import plane, robots, steer
+from appliance.cli import common, plane, robots
 from appliance.client import Stopped
 from appliance.console import SafeConsole, analysis_text, experience_table, provenance_text, revision_lines, stream_line
 from appliance.errors import RefusedError
-from appliance.llm.analysis import Analysis
 from appliance.model import (
     Act,
     ContainerInfo,
@@ -30,32 +29,32 @@ from appliance.model import (
     SoftStop,
     TaskRecord,
 )
-from appliance.plane.dht import RecordPlace
-from appliance.plane.records import Record
-from appliance.pool.api import Evicted, PoolDecision
+from appliance.model.plane_api import Record, RecordPlace
+from appliance.model.planner_api import Analysis
+from appliance.model.pool_api import Evicted, PoolDecision
+from appliance.model.robot_api import LinkList, StopAnswer
+from appliance.model.task_api import ExperienceList, Line, PlanAnswer, TaskWhy
 from appliance.pool.images import ImageState
 from appliance.records import Held
-from appliance.robots.api import LinkList, StopAnswer
-from appliance.tasks.api import ExperienceList, PlanAnswer
-from appliance.tasks.lines import Line
-from appliance.tasks.views import TaskWhy
 
 CRASHES = '[/red] x" [bold]b[/] [link=x] [/] \\[a] :warning: [@click=f]'
 
 
 def filled(kind: Any, text: str, depth: int = 0) -> Any:
-    """Return a value of a type, with a text in every place that takes one."""
+    """Return a value of a type, with a text in every place that takes one, and numbers within their bounds."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        return filled(arguments[0], text, depth)
+        value = filled(arguments[0], text, depth)
+        for meta in arguments[1:]:
+            if isinstance(meta, msgspec.Meta) and type(value) in (int, float):
+                value = bounded(value, meta)
+        return value
     if origin in (Union, types.UnionType):
         return filled(next(each for each in arguments if each is not type(None)), text, depth)
     if origin is Literal:
         return arguments[0]
-    if origin in (tuple, list, frozenset):
-        return () if depth > 8 else origin([filled(arguments[0], text, depth + 1)])
-    if origin in (dict, Mapping):
-        return {filled(arguments[0], text, depth + 1): filled(arguments[1], text, depth + 1)}
+    if origin in (tuple, list, frozenset, dict, Mapping):
+        return filled_many(origin, arguments, text, depth + 1)
     if isinstance(kind, type) and issubclass(kind, Struct):
         hints = get_type_hints(kind, include_extras=True)
         return kind(**{name: filled(hints[name], text, depth + 1) for name in kind.__struct_fields__})
@@ -63,6 +62,25 @@ def filled(kind: Any, text: str, depth: int = 0) -> Any:
         return next(iter(kind))
     plain: dict[Any, Any] = {bool: True, int: 1, float: 1.0, bytes: text.encode(), msgspec.Raw: msgspec.Raw(b"1")}
     return plain.get(kind, text)
+
+
+def filled_many(origin: Any, arguments: tuple[Any, ...], text: str, depth: int) -> Any:
+    """Return a collection with one value; a tuple of so many values with all of them."""
+    if origin in (dict, Mapping):
+        return {filled(arguments[0], text, depth): filled(arguments[1], text, depth)}
+    if origin is tuple and Ellipsis not in arguments:
+        return cast("Any", tuple(filled(each, text, depth) for each in arguments))
+    if depth > 9:
+        return cast("Any", ())
+    return origin([filled(arguments[0], text, depth)])  # pyright: ignore[reportUnknownVariableType]
+
+
+def bounded(value: float, meta: msgspec.Meta) -> float:
+    """Return a number if it is within bounds, else one of its type that is."""
+    step = 1 if type(value) is int else 2**-10
+    below = [bound for bound in (meta.le, None if meta.lt is None else meta.lt - step) if bound is not None]
+    above = [bound for bound in (meta.ge, None if meta.gt is None else meta.gt + step) if bound is not None]
+    return type(value)(max([min([value, *below]), *above]))
 
 
 def of(kind: Any, show: Callable[[Any], Any]) -> Callable[[str], Any]:
@@ -149,13 +167,17 @@ class Steered:
 
 
 @pytest.mark.parametrize(
-    ("words", "code"), [(["acts"], 0), (["standing"], 0), (["asks"], 0), (["stop", "--why", CRASHES], 4)]
+    ("words", "code"), [(["audit"], 0), (["stops"], 0), (["questions"], 0), (["stop", "--why", CRASHES], 4)]
 )
 def test_commands_print_it_as_it_is(
     words: list[str], code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Orders, stops, questions and errors, too."""
-    monkeypatch.setattr(steer, "FleetClient", lambda _: Steered())
+
+    def steered(_: object) -> Steered:
+        return Steered()
+
+    monkeypatch.setattr(common, "FleetClient", steered)
     with pytest.raises(SystemExit) as ended:
         cli.main([*words, "--connect", "tcp/127.0.0.1:1"])
     said = capsys.readouterr()

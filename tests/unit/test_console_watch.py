@@ -2,7 +2,7 @@
 
 from appliance.console import revision_lines, stream_line
 from appliance.model import Dropped, Plan, Proposal, Revision, RevisionKind, Subtask, SubtaskState, TaskRecord
-from appliance.tasks.lines import Line, LineKind
+from appliance.model.task_api import Line, LineKind
 
 
 def test_a_line_says_when_where_and_what() -> None:

@@ -2,7 +2,9 @@
 
 # ruff: noqa: ARG002, D102 - fakes have the signatures and the docstrings of what they stand for
 
+import shutil
 from collections.abc import Mapping
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import msgspec
@@ -11,13 +13,16 @@ import pytest
 from appliance.config import GatewayConfig
 from appliance.doctor import Check, FileFacts, local_checks, podman_checks, run_checks
 from appliance.errors import PoolError, PrerequisiteError, UnreachableError
+from appliance.identity.authority import Authority
 from appliance.llm.settings import LlmConfig
+from appliance.model.robot_api import MavlinkLink
+from appliance.model.roles import Role
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import ContainerSpec, Engine, EngineFacts, Found, FoundImage
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import RobotsConfig
 from appliance.skills.catalogue import load_catalogue
 
 pytestmark = pytest.mark.anyio
@@ -182,7 +187,7 @@ def test_one_runtime_is_enough() -> None:
 
 
 def test_id_mapper_without_privilege_fails() -> None:
-    """A newuidmap that lost its setuid bit, as in a badly unpacked image, is told."""
+    """A newuidmap that lost its setuid bit, as in a badly unpacked image, is reported."""
     machine = FakeMachine()
     machine.files["/usr/bin/newuidmap"] = FileFacts(owner=0, mode=0o755, writable=False)
     assert "setuid" in failed(local_checks(machine, None))["newuidmap"].detail
@@ -304,13 +309,14 @@ async def test_a_container_that_does_not_start_is_told_and_removed() -> None:
 async def test_missing_images_name_the_command() -> None:
     """Each image that is not built fails with the command that builds it."""
     found = failed(await checks_with(FakeEngine(images=False)))
-    for name in load_catalogue().images:
-        assert found[f"image {name}"].remedy == "swiftbot images build"
+    for name, spec in load_catalogue().images.items():
+        assert found[f"image {name}"].remedy == f"swiftbot images build{' learn' if spec.on_demand else ''}"
+        assert found[f"image {name}"].required != spec.on_demand
 
 
 @pytest.mark.parametrize("error", [UnreachableError("socket is not there"), PrerequisiteError("no XDG_RUNTIME_DIR")])
 async def test_without_podman_nothing_is_passed_over(error: Exception) -> None:
-    """Where Podman does not answer, what only it could tell is told to be unknown."""
+    """Where Podman does not answer, what only it could tell is shown as unknown."""
 
     def make() -> Engine:
         raise error
@@ -318,3 +324,34 @@ async def test_without_podman_nothing_is_passed_over(error: Exception) -> None:
     found = failed(await run_checks(machine=FakeMachine(), make_engine=make, open_session=no_session))
     assert {"podman api", "storage", "images", "container"} <= set(found)
     assert all(each.remedy for each in found.values())
+
+
+def test_keys_are_looked_at(tmp_path: Path) -> None:
+    """None are needed within one machine; those that are there must be this gateway's, and not about to expire."""
+    now = datetime.now(UTC)
+    authority = Authority.create(tmp_path / "authority", "default", now)
+    keys = tmp_path / "gw-1.pem"
+    authority.issue(Role.GATEWAY, "gw-1", out=keys, days=10, now=now)
+    shutil.copy(authority.roster_file, tmp_path / "roster.json")
+    plane = PlaneConfig(listen=("tls/127.0.0.1:7447",), keys=str(keys))
+    machine = FakeMachine()
+
+    def found(gateway: str, at: datetime, plane: PlaneConfig = plane) -> Check | None:
+        machine.time = at.timestamp()
+        config = GatewayConfig(id=gateway, plane=plane, llm=LlmConfig(local_model=""))
+        return failed(local_checks(machine, config)).get("keys")
+
+    assert found("gw-1", now, PlaneConfig()) is None
+    expiring = found("gw-1", now)
+    assert expiring is not None
+    assert ("expires in 10 days" in expiring.detail, expiring.required) == (True, False)
+    assert "swiftbot keys renew gateway gw-1" in expiring.remedy
+    other = found("gw-2", now)
+    assert other is not None
+    assert other.required
+    late = found("gw-1", now + timedelta(days=11))
+    assert late is not None
+    assert "expired" in late.detail
+    authority.renew(Role.GATEWAY, "gw-1", out=keys)
+    shutil.copy(authority.roster_file, tmp_path / "roster.json")
+    assert found("gw-1", now) is None

@@ -10,6 +10,7 @@ from appliance.errors import (
     ContractError,
     DeadlineError,
     Exit,
+    IdentityError,
     NotFoundError,
     PayloadError,
     PlanError,
@@ -25,6 +26,7 @@ from appliance.errors import (
     UnreachableError,
     from_code,
 )
+from appliance.identity.credentials import OlderRosterError
 
 ENDS = {
     SwiftbotError: Exit.FAILED,
@@ -44,6 +46,7 @@ ENDS = {
     ContractError: Exit.FAILED,
     UnapprovedError: Exit.REJECTED,
     RecordError: Exit.FAILED,
+    IdentityError: Exit.DENIED,
     CancelledByOperatorError: Exit.CANCELLED,
 }
 
@@ -56,7 +59,7 @@ def _all(root: type[SwiftbotError]) -> set[type[SwiftbotError]]:
 def test_a_command_ends_with_the_code_of_its_error(
     kind: type[SwiftbotError], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whatever is declined and changes nothing ends alike, a conflict among it; the cause is told, then the remedy."""
+    """Whatever is declined and changes nothing ends alike, a conflict among it; first the cause, then the remedy."""
 
     def fail(*_: object, **__: object) -> None:
         raise kind("the cause", remedy="the remedy")
@@ -76,3 +79,9 @@ def test_each_error_of_the_tree_has_a_place_in_the_table() -> None:
     for kind in ENDS:
         assert type(from_code(kind.code, "x")) is kind
     assert type(from_code("of another version", "x")) is SwiftbotError
+
+
+def test_an_error_of_one_room_travels_as_its_kind() -> None:
+    """An error without a code of its own is what it was made from, wherever it arrives."""
+    assert issubclass(OlderRosterError, IdentityError)
+    assert type(from_code(OlderRosterError("x").code, "x")) is IdentityError

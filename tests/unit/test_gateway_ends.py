@@ -20,6 +20,7 @@ class Fake:
 
     def __init__(self) -> None:
         self.plane = self
+        self.supervisor = process.Supervisor()
         self.taken = asyncio.Event()
         self.started = asyncio.Event()
         self.stopped: list[bool] = []
@@ -74,3 +75,36 @@ async def test_where_another_has_its_id_it_goes(fake: Fake) -> None:
         await running
     assert raised.value.exit_code is Exit.USAGE
     assert fake.stopped == [True]
+
+
+async def test_a_root_task_that_breaks_ends_the_process(fake: Fake) -> None:
+    """Its error is raised after everything has stopped, for the service manager to start it again."""
+
+    async def broken() -> None:
+        raise RuntimeError("a defect")
+
+    config: Any = None
+    running = asyncio.create_task(daemon.run(config))
+    await fake.started.wait()
+    fake.supervisor.start("status", broken())
+    with pytest.raises(RuntimeError, match="a defect"):
+        await running
+    assert fake.stopped == [True]
+
+
+async def test_root_tasks_are_cancelled_in_reverse_order() -> None:
+    """The last that was started ends first; one that was stopped before is not touched again."""
+    ended: list[str] = []
+
+    async def work(name: str) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.append(name)
+
+    supervisor = process.Supervisor()
+    stops = [supervisor.start(name, work(name)) for name in ("watchdog", "status", "retention")]
+    await asyncio.sleep(0)
+    await stops[1]()
+    await supervisor.close()
+    assert ended == ["status", "retention", "watchdog"]

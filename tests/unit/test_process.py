@@ -1,6 +1,9 @@
-"""The collector of cycles while the terminal UI runs, and what the machine uses is read rarely."""
+"""The collector of cycles while the terminal UI runs, what the machine uses is read rarely, systemd is notified."""
 
 import gc
+import secrets
+import socket
+from pathlib import Path
 
 import pytest
 
@@ -51,3 +54,25 @@ def test_a_reading_counts_for_half_a_second(monkeypatch: pytest.MonkeyPatch) -> 
         assert now - it.read().at < KEPT_S
     assert len(readings) == 10
     assert it.read().cpu_percent == 10.0
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_systemd_is_notified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, abstract: bool) -> None:
+    """Ready, alive and stopping arrive at the socket that systemd names, a file's or one that begins with @."""
+    name = f"@swiftbot-{secrets.token_hex(8)}" if abstract else str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as heard:
+        heard.bind("\0" + name[1:] if abstract else name)
+        heard.settimeout(5)
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        process.ready()
+        process.alive()
+        process.stopping()
+        assert [heard.recv(100) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1", b"STOPPING=1"]
+
+
+def test_without_systemd_nothing_happens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No socket is named, or nobody listens there: no error, since the work goes on."""
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    process.ready()
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
+    process.ready()

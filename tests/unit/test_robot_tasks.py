@@ -9,10 +9,10 @@ import pytest
 from appliance.errors import RefusedError
 from appliance.llm.settings import SafetyConfig
 from appliance.model import Plan, RobotInfo, Subtask, TaskRecord, TaskRequest
+from appliance.model.task_api import CancelTaskAsk, TaskAsk
 from appliance.plane.node import Plane
 from appliance.robot_tasks import MOST_HANDED_IN, RobotTasks
-from appliance.tasks.api import CancelTaskAsk, TaskAsk
-from appliance.tasks.manager import TaskManager
+from appliance.tasks.endpoints import Questions
 
 pytestmark = pytest.mark.anyio
 
@@ -31,7 +31,7 @@ class Intake:
         )
         safety = SafetyConfig(robot_tasks=policy, confirm_skills=confirm)
         self.tasks = RobotTasks(cast("Plane", self.plane), safety)
-        self.tasks.open(cast("TaskManager", self))
+        self.tasks.open(self.submit, cast("Questions", self))
 
     def owns(self, key: str) -> bool:
         """The keys of robots number one are this gateway's."""
@@ -109,7 +109,7 @@ async def test_a_robots_plan_is_its_own_where_plans_have_to_be_agreed_to() -> No
 
 
 async def test_a_robot_whose_tasks_may_do_less_stops_its_own_alone() -> None:
-    """By MAVLink anybody may name a task: who wanted it stopped is told, and a robot stops no task of others."""
+    """By MAVLink anybody may name a task: the record says who stopped it, and a robot stops no task of others."""
     intake = Intake("own")
     await intake.tasks.cancel("rover_1", "rover_1")
     with pytest.raises(RefusedError, match="ann is not a task of rover_1"):
@@ -122,7 +122,7 @@ async def test_a_robot_whose_tasks_may_do_less_stops_its_own_alone() -> None:
 
 
 async def test_what_comes_before_the_tasks_are_there_waits_for_them() -> None:
-    """What was put on a key waits; a question is told to ask again, also while the gateway drains."""
+    """What was put on a key waits; a question is answered with "ask again", also while the gateway drains."""
     intake = Intake("any")
     early = RobotTasks(cast("Plane", intake.plane), SafetyConfig())
     request = TaskRequest(instruction="land")
@@ -130,7 +130,7 @@ async def test_what_comes_before_the_tasks_are_there_waits_for_them() -> None:
     early.take("rover_2", request)  # its key is another gateway's
     with pytest.raises(RefusedError, match="gw-1 is starting"):
         await early.look("t-1")
-    early.open(cast("TaskManager", intake))
+    early.open(intake.submit, cast("Questions", intake))
     while not intake.submitted:
         await asyncio.sleep(0)
     assert [each.submitter for each in intake.submitted] == ["rover_1"]
@@ -147,6 +147,6 @@ async def test_a_robot_that_asks_without_end_is_refused() -> None:
         early.take("rover_1", TaskRequest(instruction="land"))
     assert intake.refused == 3
     early.close()
-    early.open(cast("TaskManager", intake))
+    early.open(intake.submit, cast("Questions", intake))
     await asyncio.sleep(0)
     assert intake.submitted == []

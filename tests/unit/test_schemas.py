@@ -28,6 +28,12 @@ def test_the_committed_schemas_are_up_to_date(export: ModuleType, project_root: 
     assert {file.name: file.read_text() for file in folder.glob("*.json")} == export.schemas()
 
 
+def test_schemas_of_what_commands_print_are_up_to_date(export: ModuleType, project_root: Path) -> None:
+    """Each command of the table is one, and has its schema file."""
+    folder = project_root / "docs" / "schemas" / "commands"
+    assert {file.name: file.read_text() for file in folder.glob("*.json")} == export.printed()
+
+
 def test_a_schema_tells_what_a_struct_takes(export: ModuleType) -> None:
     """The plan's schema names its subtasks' fields and tiers, and an encoded plan has no others."""
     schema = json.loads(export.schemas()["Plan.json"])

@@ -62,8 +62,8 @@ async def run(count: int, cold: int, *, progress: Callable[[str], None]) -> dict
         return {"missing": "Ray is not installed", "remedy": REMEDY}
     progress(f"Ray: {count} warm calls, {cold} new actors")
     with tempfile.TemporaryDirectory(prefix="swiftbot-ray-") as folder:
-        arguments = (str(count), str(cold), str(ACTORS), str(PAUSE_S), folder)
-        async with side(python, _SIDE, arguments, folder) as process:
+        arguments = ("startup", str(count), str(cold), str(ACTORS), str(PAUSE_S), folder)
+        async with side(python, arguments, folder) as process:
             wait_s = WAIT_S + 2 * PAUSE_S * count + 5 * cold
             found = {event: await line(process, event, wait_s) for event in ("ready", "warm", "cold")}
     times = {
@@ -80,15 +80,13 @@ async def run(count: int, cold: int, *, progress: Callable[[str], None]) -> dict
 
 
 @asynccontextmanager
-async def side(
-    python: Path, script: Path, arguments: Sequence[str], folder: str
-) -> AsyncGenerator[asyncio.subprocess.Process]:
+async def side(python: Path, arguments: Sequence[str], folder: str) -> AsyncGenerator[asyncio.subprocess.Process]:
     """Ray's side as a process group of its own, ended with all it started whatever happens here."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL_ENV"))}
     environment |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
     # -P: this folder is no place to import from.
     process = await asyncio.create_subprocess_exec(
-        str(python), "-P", str(script), *arguments,
+        str(python), "-P", str(_SIDE), *arguments,
         stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
         limit=2**24, env=environment, cwd=folder, start_new_session=True,
     )  # fmt: skip

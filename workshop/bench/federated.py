@@ -56,7 +56,7 @@ async def _measure(orders: fleet.Orders, gateway: str, phase: Phase) -> float:
     outcome = await orders.run(gateway)
     if outcome.problem or outcome.phase != phase.value:
         raise PoolError(f"a run ordered at {gateway} was {outcome.problem or outcome.phase}, not {phase}")
-    await asyncio.sleep(PAUSE_S)  # the container's state is told before the next search
+    await asyncio.sleep(PAUSE_S)  # the container's state is published before the next search
     return outcome.started_ms
 
 

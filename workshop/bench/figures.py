@@ -1,4 +1,4 @@
-"""What many measured times are told by: quantiles and the curve of their distribution. Pure.
+"""Statistics of measured times: quantiles and the curve of their distribution. Pure.
 
 Quantiles are nearest-rank: each is a time that was measured, none is interpolated. A run that was never served has
 the time `inf`, so that what fails cannot make a quantile look better.

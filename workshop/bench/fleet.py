@@ -1,6 +1,6 @@
 """A fleet of the benchmark's own on this machine, and run orders to it as a coordinator sends them.
 
-Times are those of whoever ordered: from the order (or from when it was to be sent) to the `started` event that comes
+Times are the client's: from the order (or from when it was to be sent) to the `started` event that comes
 back over Zenoh, so a search for a container, both hops and the way back are in them.
 """
 
@@ -10,17 +10,19 @@ import time
 from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import asynccontextmanager
 
+from msgspec.structs import replace
+
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.connection import FleetState
 from appliance.errors import SwiftbotError
 from appliance.llm.settings import LlmConfig
-from appliance.model import RunAccepted, RunEvent, RunEventKind, RunRequest
+from appliance.model import RunEvent, RunEventKind, RunRequest, keyspace
+from appliance.model.roles import Role
 from appliance.pool.settings import PoolConfig
-from workshop import local_fleet
+from workshop import keyring, local_fleet
 from workshop.bench.load import Arrival, Outcome
-from workshop.bench.pooled import SKILL, fleet_name, need_of, write_skill
-from workshop.bench.workspace import workspace
+from workshop.bench.pooled import SKILL, fleet_name, need_of, workspace, write_skill
 from workshop.local_fleet import Order
 
 Progress = Callable[[str], None]
@@ -28,9 +30,12 @@ Progress = Callable[[str], None]
 
 @asynccontextmanager
 async def running(
-    pools: dict[str, PoolConfig], *, image: str, progress: Progress
+    pools: dict[str, PoolConfig], *, image: str, progress: Progress, secured: bool = False
 ) -> AsyncGenerator[tuple[FleetState, "Orders"]]:
-    """A fleet with these pools (gateways `gw-1`, `gw-2`, ... in order) and a way to order; all gone afterwards."""
+    """A fleet with these pools (gateways `gw-1`, `gw-2`, ... in order) and a way to order; all gone afterwards.
+
+    `secured`: with keys; orders are given with a gateway's, since others may not give them.
+    """
     with workspace() as folder:
         skills = write_skill(folder, image)
         order = Order(
@@ -41,10 +46,15 @@ async def running(
             zenoh=0,
             base=GatewayConfig(id="gw-1", llm=LlmConfig(tiers=("rules",)), skills=(str(skills),)),
             pools=pools,
+            secured=secured,
         )
         state = await local_fleet.up(order, progress=progress)
         try:
-            async with FleetClient(state.endpoint) as client:
+            endpoint = state.endpoint
+            if secured:
+                keys = keyring.file_of(local_fleet.keys_folder(order.directory), Role.GATEWAY, "gw-1")
+                endpoint = replace(endpoint, keys=str(keys))
+            async with FleetClient(endpoint) as client:
                 yield state, Orders(client, image)
         finally:
             await local_fleet.down(order.directory, progress=progress, volumes=True)
@@ -59,7 +69,7 @@ class Orders:
         self._task = f"bench-{secrets.token_hex(4)}"
         self._number = 0
         self._open: dict[str, tuple[float, Outcome, asyncio.Event]] = {}
-        client.plane.session.subscribe_typed(client.plane.keys.run(self._task), RunEvent, self._take)
+        client.plane.session.subscribe_typed(keyspace.RUN_EVENT, self._take, self._task)
 
     def _take(self, key: str, event: RunEvent | None) -> None:
         del key
@@ -105,7 +115,7 @@ class Orders:
         )  # fmt: skip
         try:
             async with asyncio.timeout(patience_s):
-                await self.client.plane.rpc.call(gateway, "run", request, RunAccepted, timeout_s=patience_s)
+                await self.client.plane.rpc.call(gateway, keyspace.RUN, request, timeout_s=patience_s)
                 await ended.wait()
         except TimeoutError:
             outcome.problem = "lost"

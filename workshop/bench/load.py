@@ -21,7 +21,7 @@ ZIPF = 1.5
 MOST_UNSERVED = 0.01
 """Share of runs that may be refused, fail or be lost before the load counts as too much: p99 stays defined."""
 SLOWEST = 12
-"""Starts that are told one by one, the slowest first: what the tail is made of."""
+"""Starts that are listed one by one, the slowest first: what the tail is made of."""
 SATURATED = 0.9
 """A machine, or a daemon's one core, that is busy for more than this part of the time is full."""
 

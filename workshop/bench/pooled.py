@@ -1,11 +1,12 @@
-"""A pool of the benchmark's own in this process, with a skill that does what it is told: nothing, or a service time."""
+"""A pool of the benchmark's own in this process, with a skill that does as ordered: nothing, or a service time."""
 
 import secrets
+import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable, Collection
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, Callable, Collection, Generator
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,6 +20,22 @@ from appliance.pool.pool import Call, Pool
 from appliance.pool.selection import Candidate
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
+
+
+@contextmanager
+def workspace(prefix: str = "swiftbot-bench-") -> Generator[Path]:
+    """A new folder; it stays where it is when an error ends the benchmark, whose remedy names the logs in it."""
+    folder = Path(tempfile.mkdtemp(prefix=prefix))
+    try:
+        yield folder
+    except Exception:  # the folder stays: the error names the logs in it
+        raise
+    except BaseException:  # cancelled by the caller
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+
 
 T = TypeVar("T")
 WARM_UP_S = 60.0

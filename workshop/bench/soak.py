@@ -7,6 +7,8 @@ and then a container is killed from outside. Containers are replaced after `max_
 """
 
 import asyncio
+import gc
+import os
 import random
 import tempfile
 import time
@@ -16,21 +18,143 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
 from msgspec import Struct
+from msgspec.structs import asdict
 
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, PoolError, SwiftbotError
 from appliance.gateway import Gateway
 from appliance.llm.settings import LlmConfig
-from appliance.model import ContainerState, Need, RunEvent, RunEventKind, RunRequest
+from appliance.model import ContainerState, Need, RunEvent, RunEventKind, RunRequest, keyspace
+from appliance.model.task_api import RunAsk
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import LABEL_FLEET, PodmanEngine
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
-from appliance.tasks.api import RunAsk
-from workshop.bench import census, pooled
+from workshop.bench import pooled
 from workshop.bench.figures import summary
 from workshop.local_fleet import remove_containers
+
+SAMPLES = 6
+SAMPLE_S = 0.25
+"""Probes and pushes come and go in between: the least of a few samples is what stays."""
+
+
+class Census(Struct, frozen=True, kw_only=True):
+    """Counts at one moment of rest; memory in MB."""
+
+    runs: int = 0
+    """Runs done by then."""
+    containers: int = 0
+    conmon: int = 0
+    """Podman's monitor processes, one a container."""
+    volumes: int = 0
+    runner_sockets: int = 0
+    """Folders with a runner's socket."""
+    descriptors: int = 0
+    """Open files of the process, connections among them."""
+    children: int = 0
+    threads: int = 0
+    tasks: int = 0
+    """Asyncio tasks."""
+    rss_mb: float = 0.0
+    podman_rss_mb: float = 0.0
+    podman_descriptors: int = 0
+
+
+COUNTED = ("containers", "conmon", "volumes", "runner_sockets", "descriptors", "children", "threads", "tasks")
+"""What must be the same before and after."""
+SLACK = {"descriptors": 4, "threads": 4, "tasks": 2}
+"""Threads are made when first needed, up to a few, and Podman's have a connection each; a probe may be under way. What
+leaks with every run, or with every container, is beyond it after a few hundred runs."""
+GROWTH_MB = 8.0
+"""Resident memory may grow by so much between a third of the way and the end: allocators keep what they once had."""
+
+
+async def take(runs: int, *, fleet: str, run_dir: Path, engine: PodmanEngine) -> Census:
+    """Count, when the gateway in this process rests."""
+    gc.collect()
+    own = psutil.Process()
+    found: list[tuple[int, int, int, int]] = []
+    for _ in range(SAMPLES):
+        found.append(
+            (
+                len(os.listdir("/proc/self/fd")),  # noqa: PTH208 - counted, not opened
+                len(await asyncio.to_thread(own.children)),
+                own.num_threads(),
+                len(asyncio.all_tasks()),
+            )
+        )
+        await asyncio.sleep(SAMPLE_S)
+    descriptors, children, threads, tasks = (min(each) for each in zip(*found, strict=True))
+    service = await asyncio.to_thread(podman_service)
+    return Census(
+        runs=runs,
+        containers=len(await engine.containers({LABEL_FLEET: fleet})),
+        conmon=await asyncio.to_thread(conmons, fleet),
+        volumes=await volumes(fleet),
+        runner_sockets=await asyncio.to_thread(lambda: sum(1 for _ in run_dir.glob("*/runner.sock"))),
+        descriptors=descriptors,
+        children=children,
+        threads=threads,
+        tasks=tasks,
+        rss_mb=round(own.memory_info().rss / 2**20, 1),
+        podman_rss_mb=round(service.memory_info().rss / 2**20, 1) if service else 0.0,
+        podman_descriptors=service.num_fds() if service else 0,
+    )
+
+
+def conmons(fleet: str) -> int:
+    """Return how many monitor processes a fleet's containers have; they know their container's name."""
+    count = 0
+    for process in psutil.process_iter(["name", "cmdline"]):
+        line: list[str] = process.info["cmdline"] or []
+        count += process.info["name"] == "conmon" and any(each.startswith(f"swiftbot-{fleet}-") for each in line)
+    return count
+
+
+async def volumes(fleet: str) -> int:
+    """Return how many volumes a fleet has."""
+    process = await asyncio.create_subprocess_exec(
+        "podman", "volume", "ls", "--quiet", "--filter", f"label={LABEL_FLEET}={fleet}",
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL,
+    )  # fmt: skip
+    told, _ = await process.communicate()
+    return len(told.split())
+
+
+def podman_service() -> psutil.Process | None:
+    """Return the process that serves this user's API socket, if there is one."""
+    for process in psutil.process_iter(["name", "cmdline", "uids"]):
+        line: list[str] = process.info["cmdline"] or []
+        ours = process.info["name"] == "podman" and process.info["uids"].real == os.getuid()
+        if ours and line[1:3] == ["system", "service"]:
+            return process
+    return None
+
+
+def compare(counts: list[Census]) -> dict[str, Any]:
+    """Return what leaked, by comparing the last census with the first, and whether memory is flat from a third on.
+
+    The first one is taken after the first runs, when everything that is made once has been made.
+    """
+    first, last = counts[0], counts[-1]
+    before, after = asdict(first), asdict(last)
+    grown = {name: after[name] - before[name] for name in COUNTED}
+    leaks = {name: more for name, more in grown.items() if more > SLACK.get(name, 0)}
+    settled = next(each for each in counts if each.runs >= last.runs / 3)
+    growth_mb = round(last.rss_mb - settled.rss_mb, 1)
+    return {
+        "before": before,
+        "after": after,
+        "leaks": leaks,
+        "rss_growth_mb": growth_mb,
+        "rss_growth_from_runs": settled.runs,
+        "podman_rss_growth_mb": round(last.podman_rss_mb - settled.podman_rss_mb, 1),
+        "flat": growth_mb <= GROWTH_MB,
+    }
+
 
 CONTAINERS = 4
 MAX_RUNS = 100
@@ -98,7 +222,7 @@ async def run(
         progress: told each tenth.
 
     Returns:
-        `census` (see `census.compare`) and all `checkpoints`; `ended`: how runs ended, by what they did;
+        `census` (see `compare`) and all `checkpoints`; `ended`: how runs ended, by what they did;
         `unexpected`: ends that should not be; `start`: milliseconds; `runs_per_s`; `lost`: runs without an end.
 
     Raises:
@@ -108,7 +232,7 @@ async def run(
     names = [*SHARES, "nothing"]
     weights = [*SHARES.values(), 1.0 - sum(SHARES.values())]
     dos = generator.choices(names, weights, k=count)
-    counts: list[census.Census] = []
+    counts: list[Census] = []
     done: list[_Done] = []
     busy_s = 0.0
     async with _gateway(image) as gateway:
@@ -140,7 +264,7 @@ async def run(
         "killed_from_outside": soak.killed,
         "runs_per_s": round(count / busy_s, 1),
         "start": summary([each.start_ms for each in done if each.do == "nothing" and each.ended == "succeeded"]),
-        "census": census.compare(counts),
+        "census": compare(counts),
         "checkpoints": counts,
         **_ends(done),
     }
@@ -198,7 +322,7 @@ class _Soak:
         self._number = self._ended = 0
         self.killed = 0
         plane = gateway.plane
-        self._closer = plane.session.subscribe_typed(plane.keys.run("soak"), RunEvent, self._take)
+        self._closer = plane.session.subscribe_typed(keyspace.RUN_EVENT, self._take, "soak")
 
     def close(self) -> None:
         """Hear no more."""
@@ -289,7 +413,7 @@ class _Soak:
                 raise PoolError(self._gateway.pool.problem, remedy="swiftbot doctor tells more")
             await asyncio.sleep(0.1)
 
-    async def census(self, runs: int) -> census.Census:
+    async def census(self, runs: int) -> Census:
         """Count what there is."""
         config = self._gateway.config
-        return await census.take(runs, fleet=config.fleet, run_dir=Path(config.run_dir), engine=self._engine)
+        return await take(runs, fleet=config.fleet, run_dir=Path(config.run_dir), engine=self._engine)

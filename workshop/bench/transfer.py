@@ -20,11 +20,11 @@ from typing import Any
 from appliance.errors import PrerequisiteError
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
-from appliance.pool.engine import LABEL_FLEET, LABEL_GATEWAY, PodmanStorage, remove_fleet
+from appliance.pool.engine import LABEL_FLEET, LABEL_GATEWAY, PodmanEngine, remove_fleet
 from appliance.pool.settings import TransferConfig
-from appliance.pool.transfer.transfers import Transfers
-from appliance.pool.volume_store import podman_name
-from appliance.pool.volumes import Volumes
+from appliance.pool.volumes.registry import Volumes
+from appliance.pool.volumes.store import podman_name
+from appliance.pool.volumes.transfers import Transfers
 from appliance.ports import free_port
 
 _READY_S = 60.0
@@ -84,7 +84,7 @@ async def run(
 @contextlib.asynccontextmanager
 async def _gateway(
     folder: Path, fleet: str, gateway: str, ends: list[str], podman_url: str
-) -> AsyncGenerator[tuple[Plane, Transfers, Volumes, PodmanStorage]]:
+) -> AsyncGenerator[tuple[Plane, Transfers, Volumes, PodmanEngine]]:
     """As much of a gateway as transfers need."""
     await asyncio.to_thread(folder.mkdir)
     own, other = ends
@@ -92,7 +92,7 @@ async def _gateway(
     async with contextlib.AsyncExitStack() as stack:
         plane = await Plane.open(plane_config, fleet=fleet, gateway=gateway, data_dir=folder)
         stack.push_async_callback(plane.close)
-        storage = PodmanStorage(podman_url)
+        storage = PodmanEngine.for_transfers(podman_url)
         stack.callback(storage.close)
         config = TransferConfig()
         volumes = Volumes(config, fleet=fleet, gateway=gateway, store=plane.store, records=plane.dht, storage=storage)
@@ -166,7 +166,7 @@ def _change(folder: Path, megabytes: int) -> None:
     (folder / "note").write_bytes(os.urandom(1000))
 
 
-async def _by_podman(fleet: str, name: str, storage: PodmanStorage) -> float:
+async def _by_podman(fleet: str, name: str, storage: PodmanEngine) -> float:
     """Copy the same volume by Podman's own commands; milliseconds."""
     source, target = podman_name(fleet, "there", name), podman_name(fleet, "copy", name)
     await storage.ensure_volume(target, {LABEL_FLEET: fleet})

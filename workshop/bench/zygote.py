@@ -24,7 +24,7 @@ from appliance.pool.engine import EngineFacts, PodmanEngine, remove_fleet
 from appliance.pool.runs import order
 from appliance.pool.settings import PoolConfig
 from appliance.pool.starter import Starter
-from appliance.pool.state import ALONE
+from appliance.pool.volumes import ALONE
 from appliance.skills.catalogue import load_catalogue
 from workshop.bench.figures import summary
 from workshop.bench.pooled import SKILL, fleet_name, need_of, write_skill

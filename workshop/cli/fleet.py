@@ -54,7 +54,7 @@ def up(
     site: str = "warehouse",
     skills: Skills = (),
     rate: float = 1.0,
-    detach: Annotated[bool, Parameter(negative="")] = False,
+    detach: bool = False,
     where: Where = HERE,
 ) -> int:
     """Start a local fleet: gateways, recorder and simulated robots, each its own process.
@@ -89,7 +89,7 @@ def up(
 
 def down(
     *,
-    volumes: Annotated[bool, Parameter(negative="", help="Remove its state volumes too.")] = False,
+    volumes: Annotated[bool, Parameter(help="Remove its state volumes too.")] = False,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
@@ -128,9 +128,9 @@ def _ended(ended: Any, where: Where, *, volumes: bool) -> str:
 
 def demo(
     *,
-    ask: Annotated[tuple[str, ...], Parameter(negative="", help="A further instruction.")] = (),
-    tui: Annotated[bool, Parameter(negative="", help="Open the terminal UI on the running fleet.")] = False,
-    keep: Annotated[bool, Parameter(negative="", help="Leave the fleet running.")] = False,
+    ask: Annotated[tuple[str, ...], Parameter(help="A further instruction.")] = (),
+    tui: Annotated[bool, Parameter(help="Open the terminal UI on the running fleet.")] = False,
+    keep: Annotated[bool, Parameter(help="Leave the fleet running.")] = False,
     gateways: int = 3,
     robots: str = "mavlink=1,zenoh=1",
     site: str = "warehouse",

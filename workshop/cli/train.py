@@ -29,9 +29,8 @@ def train_examples(*, count: int = 10, seed: int = 1, as_json: Json = False) -> 
         seed: Of the variations.
     """
     from appliance.skills.catalogue import load_catalogue
-    from workshop.train.corpus import corpus_examples
     from workshop.train.lexicon import Lexicon
-    from workshop.train.splits import split
+    from workshop.train.splits import corpus_examples, split
     from workshop.train.vary import vary
 
     examples = split(corpus_examples(load_catalogue())).train
@@ -47,7 +46,7 @@ def train_examples(*, count: int = 10, seed: int = 1, as_json: Json = False) -> 
 
 
 @train_app.command(name="fit")
-def train_fit(run: Path, *options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> int:
+def train_fit(run: Path, /, *options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> int:
     """Train, or go on with a run that was stopped; needs `make train` once.
 
     Args:
@@ -58,7 +57,7 @@ def train_fit(run: Path, *options: Annotated[str, Parameter(allow_leading_hyphen
 
 
 @train_app.command(name="export")
-def train_export(run: Path, folder: Path, *, precision: str = "int4", most: int = 0) -> int:
+def train_export(run: Path, folder: Path, /, *, precision: str = "int4", most: int = 0, release: bool = False) -> int:
     """Make the model folder for `llm.local_model` of a run, its confidence calibrated on the held-out pairs.
 
     Args:
@@ -66,13 +65,14 @@ def train_export(run: Path, folder: Path, *, precision: str = "int4", most: int 
         folder: Where to; must not exist.
         precision: int4, int8 or fp32.
         most: Held-out pairs to calibrate on; 0 for all.
+        release: The folder may be that of the embedded planner, `models/planner`.
     """
-    arguments = [str(run), str(folder), "--precision", precision, "--most", str(most)]
+    arguments = [str(run), str(folder), "--precision", precision, "--most", str(most), *(["--release"] * release)]
     _with_torch("workshop.train.export", arguments)
 
 
 @train_app.command(name="tune")
-def train_tune(base: str, folder: Path, *options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> int:
+def train_tune(base: str, folder: Path, /, *options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> int:
     """Fine-tune a planner for a site, with its own skills and logged plans; then `export` it as any.
 
     Args:

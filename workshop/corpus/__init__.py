@@ -1,7 +1,7 @@
 """Instruction-plan pairs written by hand: what the embedded planner is trained on.
 
-The `.plan` files beside this module are the corpus, one file a setting (farm, hospital, ship, ...), in a notation made
-to be written and read by people. README.md says how to write a pair and how the rules' hard cases were settled.
+The `.plan` files beside this module are the corpus, one file for each domain, in a notation made to be written and read
+by people. README.md says how to write a pair and how the rules' hard cases were settled.
 
 Doors: `load` (every pair, by file and line), `notation.parse` and `notation.write`, `check.problems` (one pair against
 catalogue and rules), `near.too_near` (copies within the corpus or of a test set), `tally.tally` (what it covers);
@@ -17,7 +17,7 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def load(folder: Path = FOLDER) -> dict[str, Pair]:
-    """Return all pairs of a folder's `.plan` files by where they stand, such as "farm.plan:12".
+    """Return all pairs of a folder's `.plan` files by where they stand, such as "aerial.plan:12".
 
     Raises:
         PayloadError: with file and line, at the first thing that is not in the notation.

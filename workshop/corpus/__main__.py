@@ -1,4 +1,4 @@
-"""`python -m workshop.corpus`: check every pair and count what they cover, for whoever writes them.
+"""`python -m workshop.corpus`: check every pair and count what they cover, for their writers.
 
 Ends with 1 when a pair breaks the rules. Copies of test cases are looked for by the tests, which have the test set.
 """
@@ -8,9 +8,7 @@ from collections import Counter
 
 from appliance.skills.catalogue import load_catalogue
 from workshop.corpus import load
-from workshop.corpus.check import problems
-from workshop.corpus.near import too_near
-from workshop.corpus.tally import tally
+from workshop.corpus.check import problems, tally, too_near
 
 
 def main() -> int:
@@ -29,9 +27,10 @@ def main() -> int:
         ("refusals", counted.refused),
         ("skills", counted.skills),
         ("voices", counted.voices),
+        ("sources", counted.sources),
     ):
         listed = counts.items() if name == "subtasks" else counts.most_common()
-        print(f"{name}: {', '.join(f'{each} {count}' for each, count in listed)}")
+        print(f"{name}: {', '.join(f'{key} {count}' for key, count in listed)}")
     return 1 if wrong else 0
 
 

@@ -1,6 +1,8 @@
 """The notation of `.plan` files: an instruction, then its plan, a line for each subtask.
 
     # a comment
+    = hand-1
+
     > Rex, fetch the drill from bay 2.
     ~ foreman
     @ rex max
@@ -8,9 +10,10 @@
     s1 rex goto place="bay 2"
     s2 rex pick object="drill" < s1
 
-`>` lines are the instruction (several for several lines), `~` names the voice, `@` the roster, where one is known.
-Then the domain, and subtasks: id, robot (`-` for none), skill, parameters as name=JSON value, and after `<` the direct
-predecessors. An instruction that no plan answers has, in place of all that, `none KIND: why`. A blank line ends a pair.
+A line `= TAG` on its own names the source of the pairs below it, up to the next such line. `>` lines are the
+instruction (several for several lines), `~` names the voice, `@` the roster, where one is known. Then the domain, and
+subtasks: id, robot (`-` for none), skill, parameters as name=JSON value, and after `<` the direct predecessors. An
+instruction that no plan answers has, in place of all that, `none KIND: why`. A blank line ends a pair.
 
 It is a bijection with `Pair`: what `write` writes, `parse` reads as the same pair, and nothing else is accepted.
 """
@@ -34,6 +37,7 @@ _ID = re.compile(r"s[1-9][0-9]?")
 _SKILL = re.compile(r"[a-z][a-z0-9_]*")
 _ROBOT = re.compile(r"[a-z0-9][a-z0-9_.-]*|-")
 _VOICE = re.compile(r"[a-z]+")
+_SOURCE = re.compile(r"= ?([a-z0-9-]*)")
 _NONE = re.compile(rf"none ({'|'.join(KINDS)}): (\S.*)")
 _HEAD = re.compile(r"(\S+) (\S+) (\S+)(.*)")
 _PARAM = re.compile(r" ([a-z][a-z0-9_]*)=")
@@ -56,6 +60,8 @@ class Pair(Struct, frozen=True, kw_only=True):
     """One of `KINDS` when there is no plan."""
     reason: str = ""
     """Why there is none, for the person who asked."""
+    source: str = ""
+    """Tag of where the pair comes from (README.md lists them); empty when unknown."""
 
 
 def parse(text: str, *, name: str = "corpus") -> dict[int, Pair]:
@@ -70,20 +76,31 @@ def parse(text: str, *, name: str = "corpus") -> dict[int, Pair]:
     """
     pairs: dict[int, Pair] = {}
     block: list[tuple[int, str]] = []
+    source = ""
     for number, line in enumerate([*text.split("\n"), ""], start=1):
         if line.startswith("#"):
             continue
         if line:
             block.append((number, line))
         elif block:
-            pairs[block[0][0]] = _Block(name, block).pair()
+            if len(block) == 1 and (tag := _SOURCE.fullmatch(block[0][1])):
+                source = tag[1]
+            else:
+                pairs[block[0][0]] = _Block(name, block).pair(source)
             block = []
     return pairs
 
 
 def write(pairs: Iterable[Pair]) -> str:
-    """Return pairs in the notation, a blank line between them."""
-    return "\n".join(_written(pair) for pair in pairs)
+    """Return pairs in the notation, a blank line between them, and a source line wherever the source changes."""
+    blocks: list[str] = []
+    source = ""
+    for pair in pairs:
+        if pair.source != source:
+            source = pair.source
+            blocks.append(f"= {source}\n" if source else "=\n")
+        blocks.append(_written(pair))
+    return "\n".join(blocks)
 
 
 def _written(pair: Pair) -> str:
@@ -114,7 +131,7 @@ class _Block:
         self._lines = lines
         self._at = 0
 
-    def pair(self) -> Pair:
+    def pair(self, source: str) -> Pair:
         instruction = "\n".join(self._run(">"))
         if not instruction.strip():
             self._fail("a pair begins with its instruction: > text")
@@ -125,7 +142,7 @@ class _Block:
         if any(not _ROBOT.fullmatch(robot) or robot == "-" for robot in robots):
             self._at -= 1
             self._fail("a roster is robot names with blanks between them")
-        pair = Pair(instruction=instruction, voice=voice, robots=robots)
+        pair = Pair(instruction=instruction, voice=voice, robots=robots, source=source)
         head = self._peek()
         if match := _NONE.fullmatch(head):
             self._at += 1

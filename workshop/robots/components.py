@@ -218,7 +218,7 @@ class SimCamera(Component):
 
 
 class SimGimbal(Component):
-    """Turns at a bounded rate within its limits, for whoever is in control of it."""
+    """Turns at a bounded rate within its limits, for the one in control of it."""
 
     number = dialect.COMPONENT_GIMBAL
     kind = dialect.TYPE_GIMBAL

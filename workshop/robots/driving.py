@@ -57,7 +57,7 @@ class Driving:
         self.speed = 0.0
 
     def by_hand(self, east_mps: float, north_mps: float, turn_dps: float) -> None:
-        """Move as a person asks, until it is told otherwise or halts; a base with wheels for every direction."""
+        """Move as a person asks, until the next order or a halt; a base with wheels for every direction."""
         self._way = []
         self._by_hand = (east_mps, north_mps, turn_dps)
 

@@ -1,6 +1,6 @@
 """How people of the simulated world answer what a skill asks through a robot (`ask`): they hear it when they are near.
 
-The question is put by the gateway that runs the skill, for operators and whoever else can answer. A simulated robot
+The question is put by the gateway that runs the skill, for operators and all others who can answer. A simulated robot
 hears those that are asked through it, and hands in what the person beside it says, as an operator would. The first
 answer counts.
 """
@@ -12,7 +12,7 @@ import msgspec
 import structlog
 
 from appliance.errors import SwiftbotError
-from appliance.model import Enquiry, encode
+from appliance.model import Enquiry, encode, keyspace
 from appliance.plane.session import Closer, Session
 from appliance.robots.verbs import AskArgs, RobotFailure
 from workshop.robots.around import Around
@@ -52,8 +52,8 @@ class Ears:
         """Begin to listen."""
         session, keys = self._session, self._session.keys
         self._closers = [
-            session.subscribe_typed(keys.enquiry(), Enquiry, self._take),
-            session.watch_alive(keys.alive(), self._seen),
+            session.subscribe_typed(keyspace.ENQUIRY, self._take),
+            session.watch_alive(keys(keyspace.GATEWAY_ALIVE), self._seen),
         ]
 
     async def close(self) -> None:
@@ -65,7 +65,7 @@ class Ears:
         await asyncio.gather(*self._asking, return_exceptions=True)
 
     def _seen(self, key: str, alive: bool) -> None:
-        gateway = key.split("/")[-2]
+        (gateway,) = keyspace.GATEWAY_ALIVE.names(key)
         if alive:
             self._gateways.add(gateway)
         else:
@@ -95,8 +95,8 @@ class Ears:
         # The same order at the next gateway is the same order.
         for gateway in sorted(self._gateways)[:_TRIES]:
             try:
-                key = self._session.keys.rpc(gateway, "answer")
-                await self._session.query(key, encode(answer), timeout_s=_TIMEOUT_S)
+                key = self._session.keys(keyspace.RPC, gateway, "answer")
+                await self._session.query(key, encode(answer), timeout_s=_TIMEOUT_S, sign=True)
             except SwiftbotError as error:
                 log.info("the answer was not taken", robot=self._robot, gateway=gateway, reason=str(error))
             else:
@@ -104,5 +104,5 @@ class Ears:
 
 
 def _person(to: str) -> str:
-    """Whoever is near, for a question to operators in general."""
+    """The person near, for a question to operators in general."""
     return "" if to in ("", "operator", "anybody", "somebody") else to

@@ -14,11 +14,11 @@ from msgspec import Struct, field
 
 from appliance.errors import ConfigError
 from appliance.model import Site
+from appliance.model.robot_api import MAX_SYSTEM, Remote, read_remote
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.links import Link, open_link
 from appliance.robots.mavlink.signing import Signer, read_key
-from appliance.robots.settings import MAX_SYSTEM, Remote, read_remote
 from workshop.robots.air import Air, Channel
 from workshop.robots.autopilot import AnyAutopilot
 from workshop.robots.components import Component, SimCamera, SimGimbal
@@ -155,7 +155,7 @@ class Simulation:
         for number in (dialect.COMPONENT_AUTOPILOT, *(part.number for part in self.parts)):
             self._codecs[number] = Codec(self._settings.system, number, signer=signer)
         codec = self._codecs[dialect.COMPONENT_AUTOPILOT]
-        self._link = await open_link(self._settings.remote, codec, self._heard)
+        self._link = await open_link(self._settings.remote, codec, self)
         log.info("simulated vehicle", kind=self._settings.kind, system=self._settings.system, to=self._settings.to)
         began = before = time.monotonic()
         try:
@@ -192,8 +192,14 @@ class Simulation:
                 self._due[name] = max(self._due[name] + interval, now)
                 self._send([telemetry(vehicle, name, boot_ms)])
 
-    def _heard(self, frame: Frame, address: tuple[str, int]) -> None:
-        del address
+    @property
+    def busy(self) -> bool:
+        """Never: what comes is small."""
+        return False
+
+    def receive(self, link: int, frame: Frame, address: tuple[str, int]) -> None:
+        """Take a frame off the link."""
+        del link, address
         now = time.monotonic()
         self._up.send(frame, now)
         self._arrived(now)
@@ -229,7 +235,7 @@ class Simulation:
             self._down.send(self._codecs[component].pack(message), now)
 
     def _transmit(self, now: float) -> None:
-        """Hand over what has come through the air to whoever is there."""
+        """Hand over what has come through the air to all that are there."""
         if self._link is None:
             return
         for raw in self._down.due(now):

@@ -1,7 +1,7 @@
 """The small world of simulated robots: things of a site, who holds them, doors, devices, and the people about.
 
 Every simulated robot has its own copy, made of the site's objects; what one robot does to a thing it puts on the
-plane, and the others follow. Two that act at once are told apart by a counter and the writer's name, so all copies
+plane, and the others follow. A counter and the writer's name order two that act at once, so all copies
 end equal (last writer wins, Lamport's order). Pure.
 """
 
@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Struct
 
 from appliance.model import Box, Person, Pose, Site
+from appliance.model.keys import Topic, Untyped
 from appliance.model.site import bearing_deg, inside
 from appliance.robots.verbs import RobotFailure
 
@@ -42,6 +43,23 @@ class Thing(Struct, frozen=True, kw_only=True):
     """Of a door `open` or `closed`, of a device `on` or `off`; empty for what has no state."""
     counter: int = 0
     writer: str = ""
+
+
+WORLD_OF = Topic(
+    "robot/{robot}/world",
+    Untyped,
+    "nothing → the things a simulated robot knows of",
+    form="query",
+    writer="answered by a simulated robot",
+    often="when another starts",
+)
+WORLD = Topic(
+    "world/{thing}",
+    Thing,
+    writer="a simulated robot that picked it up or put it down",
+    often="on change",
+    kept="by simulated robots",
+)
 
 
 class Things(Struct, frozen=True):

@@ -19,9 +19,9 @@ import structlog
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, ConflictError, UnreachableError
-from appliance.model import Notice, Pose, RobotCommand, RobotInfo, Site, encode
+from appliance.model import Notice, Pose, RobotCommand, RobotInfo, Site, encode, keyspace
+from appliance.model.keys import check_name
 from appliance.model.site import blocked_leg
-from appliance.plane.keys import check_name
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.robots.executor import UNREADABLE, CommandExecutor, Done, IdempotencyLog, Verb
@@ -45,7 +45,7 @@ from workshop.robots.around import Around
 from workshop.robots.driving import Driving
 from workshop.robots.ears import Ears
 from workshop.robots.mavlink import start_point
-from workshop.robots.world import Aim, Thing, Things, World, aim, words
+from workshop.robots.world import WORLD, WORLD_OF, Aim, Thing, Things, World, aim, words
 
 log = structlog.get_logger(__name__)
 
@@ -169,16 +169,16 @@ class Rover:
         """Move, tell and answer until `stop` is set."""
         session, keys = self._session, self._session.keys
         async with AsyncExitStack() as stack:
-            follow = session.subscribe_typed(keys.world(), Thing, self._follow)
+            follow = session.subscribe_typed(WORLD, self._follow)
             stack.callback(follow.close)
-            stack.callback(session.subscribe_typed(keys.robot(self.name), RobotInfo, self._meet).close)
+            stack.callback(session.subscribe_typed(keyspace.ROBOT, self._meet, self.name).close)
             await self._catch_up()
             if not await self._named_alone(stop):
                 return
             for closer in (
-                session.serve(keys.world_of(self.name), self._tell_world),
-                session.serve(keys.command(self.name), self.desk.handle),
-                session.declare_alive(keys.robot_alive(self.name)),
+                session.serve(keys(WORLD_OF, self.name), self._tell_world),
+                session.serve(keys(keyspace.COMMAND, self.name), self.desk.handle, signers=keyspace.COMMAND.asks),
+                session.declare_alive(keys(keyspace.ROBOT_ALIVE, self.name)),
             ):
                 stack.callback(closer.close)
             stack.push_async_callback(self.desk.close)
@@ -197,21 +197,21 @@ class Rover:
         while await self._until_free(stop):
             # One that started at the same instant holds no token yet: both show themselves first.
             await self._settle(stop)
-            if not await self._session.alive_now(self._session.keys.robot_alive(self.name)):
+            if not await self._session.alive_now(self._session.keys(keyspace.ROBOT_ALIVE, self.name)):
                 return not stop.is_set()
         return False
 
     async def _until_free(self, stop: asyncio.Event) -> bool:
         """Wait until no robot holds the token of this name, which is reported once; False when it is to stop first."""
         session, reported, seen_at = self._session, False, -math.inf
-        while await session.alive_now(session.keys.robot_alive(self.name)):
+        while await session.alive_now(session.keys(keyspace.ROBOT_ALIVE, self.name)):
             if not reported:
                 reported = True
                 log.error("another robot has this name: waiting until it is gone", robot=self.name)
                 self._report_namesake()
             if time.monotonic() - seen_at >= _SEEN_S:
                 seen_at = time.monotonic()
-                session.put(session.keys.robot(self.name), encode(self.info()))  # heeded by no roster, but seen
+                session.publish(keyspace.ROBOT, self.info(), self.name)  # heeded by no roster, but seen
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_RETRY_S):
                     await stop.wait()
@@ -225,7 +225,7 @@ class Rover:
             text=f"a second robot that calls itself {self.name} is refused: give it a name of its own",
             at_ns=time.time_ns(),
         )
-        self._session.put(self._session.keys.notice(_OPERATOR), encode(notice))
+        self._session.publish(keyspace.NOTICE, notice, _OPERATOR)
 
     def _meet(self, key: str, info: RobotInfo | None) -> None:
         """Hear the states under this name: of two that started at the same instant the older has it, as in rosters."""
@@ -238,7 +238,7 @@ class Rover:
         self._older = ""  # of those that have gone
         until = time.monotonic() + _SETTLE_S
         while time.monotonic() < until and not stop.is_set():
-            self._session.put(self._session.keys.robot(self.name), encode(self.info()))
+            self._session.publish(keyspace.ROBOT, self.info(), self.name)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(STATE_S):
                     await stop.wait()
@@ -258,7 +258,7 @@ class Rover:
             if self._older:
                 # A log that is played tells of older ones, too: what counts is one that takes commands.
                 asked = encode(RobotCommand(id=f"{self.name}/who", verb="state"))
-                key = self._session.keys.command(self.name)
+                key = self._session.keys(keyspace.COMMAND, self.name)
                 if await self._session.answerers(key, asked, timeout_s=_SNAPSHOT_S) > 1:
                     self._yield_name()
                 self._older = ""
@@ -270,7 +270,7 @@ class Rover:
             self.world.carry(self.name, self.driving.pose)
             if now - told >= STATE_S:
                 told = now
-                self._session.put(self._session.keys.robot(self.name), encode(self.info()))
+                self._session.publish(keyspace.ROBOT, self.info(), self.name)
             try:
                 async with asyncio.timeout(TICK_S):
                     await stop.wait()
@@ -383,7 +383,7 @@ class Rover:
         return Done({"object": thing.name, "at": args.at, "position": {"x": put.x, "y": put.y}} | self._where())
 
     def _announce(self, thing: Thing) -> None:
-        self._session.put(self._session.keys.world(words(thing.name).replace(" ", "_")), encode(thing))
+        self._session.publish(WORLD, thing, words(thing.name).replace(" ", "_"))
 
     def _follow(self, key: str, thing: Thing | None) -> None:
         if thing is not None and not self.world.take_in(thing):
@@ -394,7 +394,7 @@ class Rover:
 
     async def _catch_up(self) -> None:
         """Ask the robots that are here already what has become of the things."""
-        for message in await self._session.query_all(self._session.keys.world_of(), b"", timeout_s=_SNAPSHOT_S):
+        for message in await self._session.query_all(self._session.keys(WORLD_OF), b"", timeout_s=_SNAPSHOT_S):
             try:
                 told = msgspec.json.decode(message.payload, type=Things)
             except UNREADABLE as error:
@@ -465,7 +465,7 @@ class Rover:
             "data": base64.b64encode(data).decode(),
             "format": form,
         }
-        self._session.put(self._session.keys.camera(self.name), encode(image))
+        self._session.put(self._session.keys(keyspace.CAMERA, self.name), encode(image))
 
     # --- pieces ------------------------------------------------------------------------------------------------
 

@@ -1,12 +1,18 @@
-"""Writes what a model folder has beside the library's own files: `planner.json`, and the model card for people."""
+"""Writes what a model folder has beside the library's own files: `planner.json`, the model card, and the hashes.
 
+`outside_release` keeps training out of the folder of the planner that comes with the program.
+"""
+
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from appliance.errors import ConflictError
 from appliance.llm.decoder import CARD, Card
+from appliance.llm.settings import EMBEDDED_FOLDER
 from appliance.llm.words import MAX_WORDS
 from appliance.skills.catalogue import Catalogue
 from workshop.train.tokens import BEGIN, END, LITERAL, PLAN, ROSTER, Tokens, symbols_of
@@ -25,6 +31,28 @@ def card_of(
 def write_card(folder: Path, card: Card) -> None:
     """Write the card into a model folder."""
     (folder / CARD).write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=1))
+
+
+SUMS = "SHA256SUMS"
+
+
+def write_sums(folder: Path) -> None:
+    """Write the hash of every file of a model folder but the card for people, as `sha256sum --check` reads them."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in {SUMS, "README.md"})
+    lines = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(folder)}\n" for path in files]
+    (folder / SUMS).write_text("".join(lines))
+
+
+def outside_release(folder: Path) -> None:
+    """Refuse a folder that is the embedded planner's or within it.
+
+    Raises:
+        ConflictError: it is.
+    """
+    if folder.resolve().is_relative_to(EMBEDDED_FOLDER.resolve()):
+        raise ConflictError(
+            f"{folder} is the planner that comes with the program", remedy="give another folder, or --release"
+        )
 
 
 FIGURES = ("decomposition", "parallel_recall", "subtask_f1", "param_f1", "exact", "domain", "refused")
@@ -60,6 +88,7 @@ def model_card(
             "Turns an English instruction for a robot fleet into a plan, in the plan language of this project. Trained",
             f"from scratch; {precision} weights, {made['megabytes']} MB.",
             "",
+            "- **Licence**: Apache-2.0, like the program.",
             "- **Data**: the hand-written pairs of `workshop/corpus`, varied while training, and in a tuned one",
             "  a site's own. Neither the development cases nor any other test data.",
             f"- **Training**: {figures.get('step', '?')} steps; {settings}.",
@@ -73,8 +102,8 @@ def model_card(
                 if made.get("beside")
                 else []
             ),
-            "- **Limits**: English only; 256 words with the roster; names only as they are said; no task that has",
-            "  begun is continued. What it plans is checked by the validator and the safety policy in any case.",
+            "- **Limits**: English only; 256 words with the robots that they name; names only as they are said; no",
+            "  task that has begun is continued. What it plans is checked by the validator and the safety policy.",
             "",
             "## Held-out pairs",
             "",

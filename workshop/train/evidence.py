@@ -21,11 +21,10 @@ from torch.nn import functional
 
 from appliance.llm.decoder import Evidence, cues, skills_of, write_evidence
 from appliance.skills.catalogue import Catalogue, load_catalogue
-from workshop.train.corpus import corpus_examples
-from workshop.train.ending import ended
+from workshop.train.card import outside_release, write_sums
+from workshop.train.ending import ended, writing
 from workshop.train.examples import Example
-from workshop.train.splits import split
-from workshop.train.writing import writing
+from workshop.train.splits import corpus_examples, split
 
 ROUNDS = 8
 RATE = 0.02
@@ -100,6 +99,7 @@ def write(folder: Path, catalogue: Catalogue) -> dict[str, object]:
     evidence = learn(parts.train, catalogue)
     with writing(f"{folder}", remedy="make room and run it again"):
         write_evidence(folder, evidence)
+        write_sums(folder)
     held_out = (*parts.structure, *parts.vocabulary, *parts.chance)
     return {"pairs": len(parts.train), "skills": len(evidence.skills), "held_out_f1": quality(evidence, held_out)}
 
@@ -108,7 +108,10 @@ def main(arguments: Sequence[str]) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description="Write the second opinion on answers into a model folder.")
     parser.add_argument("folder", type=Path, help="of the model")
+    parser.add_argument("--release", action="store_true", help="the folder may be the embedded planner's")
     given = parser.parse_args(arguments)
+    if not given.release:
+        outside_release(given.folder)
     print(json.dumps(write(given.folder, load_catalogue())))
     return 0
 

@@ -27,13 +27,12 @@ from appliance.llm.settings import folder_of
 from appliance.llm.words import words_of
 from appliance.llm.worker import Worker
 from appliance.skills.catalogue import Catalogue
-from workshop.train.card import card_of, model_card, write_card
-from workshop.train.corpus import corpus_examples
+from workshop.train.card import card_of, model_card, outside_release, write_card, write_sums
 from workshop.train.ending import ended
 from workshop.train.evidence import learn
 from workshop.train.examples import Example
 from workshop.train.judge import is_exact
-from workshop.train.splits import split
+from workshop.train.splits import corpus_examples, split
 from workshop.train.tokens import BEGIN, END, PAD, Tokens
 from workshop.train.tune import catalogue_of
 
@@ -42,7 +41,9 @@ BINS = 10
 
 BESIDE = ("second", "third", "fourth")
 """Folders, in that of a planner, of the models that are asked besides."""
-_FILES = ("genai_config.json", "model.onnx", "model.onnx.data", "tokenizer.json", "tokenizer_config.json")
+_FILES = ("genai_config.json", "model.onnx", "model.onnx.data")
+"""What a model besides has of its own: the tokenizer is the planner's."""
+_TOKENIZER = "tokenizer.json"
 
 
 def export(
@@ -108,6 +109,7 @@ def export(
         "beside": list(card.beside),
     }
     (folder / "README.md").write_text(model_card(precision, recipe, figures, made, cases=len(held_out)))
+    write_sums(folder)
     return made
 
 
@@ -116,7 +118,7 @@ def _put_beside(folder: Path, inside: str, beside: Path, card: Card) -> None:
     other = read_card(beside)
     if other is None:
         raise NotFoundError(f"{beside} is no planner", remedy="give a folder that `swiftbot train export` made")
-    if other.tokens != card.tokens:
+    if other.tokens != card.tokens or (beside / _TOKENIZER).read_bytes() != (folder / _TOKENIZER).read_bytes():
         raise ConflictError(
             f"{beside} has other tokens than {folder}", remedy="give a planner of a run that began with the same one"
         )
@@ -191,9 +193,18 @@ def main(arguments: Sequence[str]) -> int:
         default=[],
         help=f"a planner's folder, or `embedded`: its model is asked besides; at most {len(BESIDE)}",
     )
+    parser.add_argument("--release", action="store_true", help="replace the folder, also that of the embedded planner")
     given = parser.parse_args(arguments)
-    beside = [Path(folder_of(each)) for each in given.beside]
-    made = export(given.run, given.folder, precision=given.precision, most=given.most, beside=beside)
+    beside = [Path(folder_of(folder)) for folder in given.beside]
+    if not given.release:
+        outside_release(given.folder)
+    folder: Path = given.folder
+    # A release replaces the folder whole, once its successor is done: `beside` may read from it until then.
+    target = folder.with_name(f"{folder.name}.new") if given.release else folder
+    made = export(given.run, target, precision=given.precision, most=given.most, beside=beside)
+    if given.release:
+        shutil.rmtree(folder, ignore_errors=True)
+        target.rename(folder)
     print(json.dumps(made, indent=1))
     return 0
 

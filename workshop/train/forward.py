@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from workshop.train.batches import IGNORED
+from workshop.train.fit import IGNORED
 
 HALF = torch.bfloat16
 

@@ -63,7 +63,7 @@ def joined(one: Example, two: Example, rng: random.Random) -> Example | None:
 
 
 def abreast(one: Example, two: Example, rng: random.Random) -> Example | None:
-    """Return two clauses as one sentence, for different robots side by side: whoever waits for one waits with both."""
+    """Return two clauses as one sentence, for different robots side by side: what waits for one waits for both."""
     if not is_a_clause(one) or not is_a_clause(two) or "none" in (one.symbols[0], two.symbols[0]):
         return None
     firsts, seconds = robots_of(one), robots_of(two)

@@ -18,10 +18,10 @@ from appliance.errors import ConflictError, NotFoundError
 from appliance.llm.decoder import read_card
 from appliance.llm.settings import folder_of
 from appliance.skills.catalogue import Catalogue
-from workshop.train.batches import CONTEXT
+from workshop.train.ending import writing
+from workshop.train.fit import CONTEXT
 from workshop.train.tokens import BEGIN, END, PAD, Tokens
 from workshop.train.weights import is_model, read_weights
-from workshop.train.writing import writing
 
 CHECKPOINT = "checkpoint.pt"
 RECIPE = "recipe.json"
@@ -47,7 +47,7 @@ class Recipe:
     original: float = 0.1
     """Share of examples as they were written, without variation."""
     dropout: float = 0.0
-    """Share of what a layer adds, and of a token's embedding, that is left out of a step, anew each time."""
+    """Share of what a layer adds, and of a token's embedding, that is left out of a step, drawn for each."""
     twice: bool = False
     """Whether an instruction is read twice before it is answered (`tokens`)."""
 

@@ -3,7 +3,8 @@
 Three sets, disjoint from what is trained on and from one another: by *structure*, plans whose sequence of skills and
 edges occurs in no trained plan; by *vocabulary*, instructions with a name (thing, place, person) that no trained
 instruction has; and by *chance*. Which pair is where follows from its text alone, so a corpus that grows keeps its
-splits.
+splits. The order within each part follows from the texts too, so that a sample or a half of what is held out is the
+same whatever files the pairs are in.
 """
 
 import hashlib
@@ -12,7 +13,15 @@ from collections.abc import Iterable
 from msgspec import Struct
 
 from appliance.llm.language import ANY
-from workshop.train.examples import ROBOT, Example, said, spans
+from appliance.skills.catalogue import Catalogue
+from workshop.corpus import load
+from workshop.train.examples import ROBOT, Example, example_of, said, spans
+
+
+def corpus_examples(catalogue: Catalogue) -> list[Example]:
+    """Return the examples of all hand-written pairs."""
+    return [example_of(pair, catalogue) for pair in load().values()]
+
 
 STRUCTURES = 24
 """One in so many structures is held out, of those with at least three subtasks."""
@@ -32,12 +41,12 @@ class Splits(Struct, frozen=True):
 
 
 def split(examples: Iterable[Example]) -> Splits:
-    """Return a corpus in parts."""
+    """Return a corpus in parts, each in the order of its texts' digests."""
     train: list[Example] = []
     structure: list[Example] = []
     vocabulary: list[Example] = []
     chance: list[Example] = []
-    for example in examples:
+    for example in sorted(examples, key=lambda example: _digest(" ".join(example.words))):
         if example.symbols.count("|") >= 2 and _chosen("structure " + shape(example), STRUCTURES):
             structure.append(example)
         elif any(_chosen("name " + name, NAMES) for name in names(example)):
@@ -73,4 +82,8 @@ def names(example: Example) -> frozenset[str]:
 
 
 def _chosen(text: str, one_in: int) -> bool:
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") % one_in == 0
+    return int.from_bytes(_digest(text)[:4], "big") % one_in == 0
+
+
+def _digest(text: str) -> bytes:
+    return hashlib.sha256(text.encode()).digest()

@@ -3,8 +3,8 @@
 """Fine-tunes a planner for a site, the embedded one or another: its own skills and way of speaking, from logged plans.
 
 Half of each batch (`--share`) is the site's pairs, varied as all are, the other half the hand-written ones, so that
-what was learned is not forgotten. A tenth of the site's pairs is held out; figures on it are told before and after. The
-result is a run like any other: `export` makes its model folder.
+what was learned is not forgotten. A tenth of the site's pairs is held out; its figures are printed before and after.
+The result is a run like any other: `export` makes its model folder.
 
     python -m workshop.train.tune embedded NEW --plans PLANS.jsonl --skills FOLDER --minutes 20
 """

@@ -8,7 +8,7 @@ the plan itself.
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 from msgspec import Struct
 
@@ -18,6 +18,7 @@ from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import Reading, Token, read, stem
 from appliance.llm.settings import PlanContext, SafetyConfig
 from appliance.llm.values import FREE, figures, quantity, unit_of
+from appliance.llm.words import forms
 from appliance.model import Plan, Site, Subtask
 from appliance.skills.catalogue import Catalogue, SkillManifest
 
@@ -29,20 +30,6 @@ _GAP = 5
 _PARTICLES = frozenset(
     ("up", "down", "on", "off", "out", "back", "away", "over", "in", "together", "around", "for", "to", "at", "know")
 )
-_IRREGULAR = {
-    "go": ("goes", "going", "gone", "went"), "fly": ("flies", "flying", "flown"), "take": ("takes", "taking", "taken"),
-    "put": ("puts", "putting"), "bring": ("brings", "bringing", "brought"), "drive": ("drives", "driving", "driven"),
-    "get": ("gets", "getting"), "give": ("gives", "giving", "given"), "shoot": ("shoots", "shooting"),
-    "say": ("says", "saying", "said"),
-    "tell": ("tells", "telling"), "find": ("finds", "finding", "found"),
-    "hold": ("holds", "holding", "held"), "leave": ("leaves", "leaving", "left"), "set": ("sets", "setting"),
-    "shut": ("shuts", "shutting"),
-    "come": ("comes", "coming"),
-    "run": ("runs", "running"), "be": ("is", "are", "being"),
-    "read": ("reads", "reading"), "send": ("sends", "sending", "sent"), "make": ("makes", "making"),
-    "keep": ("keeps", "keeping"), "wait": ("waits", "waiting"), "let": ("lets", "letting"),
-    "lift": ("lifts", "lifting"),
-}  # fmt: skip
 _PARAM_WORDS = {
     "laps": ("lap", "laps", "times", "round", "rounds", "circuit", "circuits", "loop", "loops"),
     "count": ("times", "shots", "pictures", "photos"),
@@ -108,7 +95,8 @@ def account(reading: Reading, plan: Plan, catalogue: Catalogue, site: Site | Non
         for name, value in subtask.params.items():
             if name == "robots":
                 continue
-            said = _said(reading, name, value, site)
+            said = robot_said(reading, value, subtask.skill, catalogue) if isinstance(value, str) else None
+            said = said or _said(reading, name, value, site)
             if said and name not in FREE and not isinstance(value, int | float):
                 # A name that swallows "unless" or "then" has not accounted for it.
                 said = {index for index in said if reading.tokens[index].text not in lx.GUARDS}
@@ -295,6 +283,41 @@ def text_said(reading: Reading, text: str, site: Site | None = None) -> set[int]
     return _scattered(reading, _words(text))
 
 
+def robot_said(reading: Reading, text: str, skill: str, catalogue: Catalogue) -> set[int] | None:
+    """Return the mentions of a robot to which a skill is done ("drone_1 tracks rover_2"); None where there is none.
+
+    A phrase of the skill or a preposition stands before them. All others may be of the one that does something:
+    "drone_1 tracks rover_2, then send rover_2 to dock 1".
+    """
+    tokens = reading.tokens
+    named = [
+        number
+        for number, token in enumerate(tokens)
+        if number and token.kind == "robot" and token.group == "one" and token.robots == (text,)
+    ]
+    if not named:
+        return None
+    verbs = {
+        at
+        for options in claims(reading, catalogue)
+        for claim in options
+        if skill in claim.skills and skill not in _ways(catalogue)
+        for at in claim.at
+    }
+    found: set[int] = set()
+    for number in named:
+        before = number - 1
+        while before > 0 and tokens[before].text in ("the", "our", "my"):
+            before -= 1
+        if before in verbs or tokens[before].text in _NOT_SUBJECT or tokens[before].text in _TOWARDS:
+            found.add(number)
+    return found or None
+
+
+_TOWARDS = frozenset(("of", "on", "onto", "into", "about", "against"))
+"""Further prepositions before a robot to which something is done: "a photo of rover_2"."""
+
+
 def _point_said(reading: Reading, text: str) -> set[int] | None:
     """The tokens of a coordinate: its numbers one after the other, with nothing but marks and units between."""
     wanted = [float(each.replace("−", "-")) for each in re.findall(r"[-−]?\d+(?:\.\d+)?", text)]
@@ -320,11 +343,9 @@ _AXES = frozenset(("x", "y", "z", "m", "metres", "meters", ";"))
 
 
 def _words(text: str) -> list[str]:
-    return [
-        each.removesuffix("'s")
-        for each in re.findall(r"[-−]?\d+(?:[.,]\d+)*|[^\W\d_]+(?:'[^\W\d_]+)*", figures(text.casefold()))
-        if each not in ARTICLES or len(text.split()) == 1
-    ]
+    words: list[str] = re.findall(r"[-−]?\d+(?:[.,]\d+)*|[^\W\d_]+(?:'[^\W\d_]+)*", figures(text.casefold()))
+    last = len(words) - 1  # "rack a": a label, no article
+    return [each.removesuffix("'s") for at, each in enumerate(words) if each not in ARTICLES or at == last]
 
 
 def _same(said: str, wanted: str) -> bool:
@@ -402,26 +423,6 @@ def _heads(reading: Reading, plan: Plan, found: Account) -> None:
 
 
 # --- skills --------------------------------------------------------------------------------------------------------
-
-
-@lru_cache(maxsize=4096)
-def forms(verb: str) -> frozenset[str]:
-    """Return a verb's forms as orders use them: "photograph", "photographs", "photographing", "photographed"."""
-    found = {verb, *_IRREGULAR.get(verb, ())}
-    if verb in _IRREGULAR:
-        return frozenset(found)
-    found.add(f"{verb}s")
-    if verb.endswith(("s", "x", "z", "ch", "sh", "o")):
-        found.add(f"{verb}es")
-    if len(verb) > 2 and verb.endswith("y") and verb[-2] not in "aeiou":
-        found |= {f"{verb[:-1]}ies", f"{verb[:-1]}ied"}
-    if verb.endswith("e"):
-        found |= {f"{verb[:-1]}ing", f"{verb}d"}
-    else:
-        found |= {f"{verb}ing", f"{verb}ed"}
-        if len(verb) > 2 and verb[-1] not in "aeiouwxy" and verb[-2] in "aeiou":
-            found |= {f"{verb}{verb[-1]}ing", f"{verb}{verb[-1]}ed"}
-    return frozenset(found)
 
 
 def phrase_table(catalogue: Catalogue) -> Mapping[str, tuple[tuple[tuple[str, ...], frozenset[str]], ...]]:
@@ -576,12 +577,102 @@ def _param_words(reading: Reading, subtask: Subtask, found: Account, *, names: I
     for name in subtask.params if names is None else names:
         words = _PARAM_WORDS.get(name, ()) if name in subtask.params else ()
         for number, token in enumerate(reading.tokens):
-            if token.text in words and number not in found.covered and _near(number, said, reading):
+            near = _beside if name == "place" else _near
+            if token.text in words and number not in found.covered and near(number, said, reading):
                 found.covered.add(number)
 
 
 def _near(index: int, said: set[int], reading: Reading) -> bool:
     return any(abs(each - index) <= 4 and reading.sentence[each] == reading.sentence[index] for each in said)
+
+
+def _beside(index: int, said: set[int], reading: Reading) -> bool:
+    """Whether nothing but marks, articles and such words stand between a word of a place and the place itself."""
+    between = ARTICLES | _BLANK | _AXES | frozenset((*_PARAM_WORDS["place"], "at", "to", "is"))
+    for step in (1, -1):
+        at = index + step
+        while 0 <= at < len(reading.tokens) and abs(at - index) <= _GAP:
+            if at in said:
+                return True
+            if reading.tokens[at].text not in between:
+                break
+            at += step
+    return False
+
+
+_NOT_SUBJECT = frozenset(
+    (
+        "to",
+        "follow",
+        "follows",
+        "following",
+        "towards",
+        "toward",
+        "behind",
+        "beside",
+        "near",
+        "from",
+        "at",
+        "meet",
+        "around",
+    )
+)
+"""Words before a robot that is no subject: "give the box to rover_2"."""
+_AND = frozenset((",", "and", "&", "plus"))
+
+
+def _governors(reading: Reading, found: Account) -> list[frozenset[str]]:
+    """For each token the robots that may be its subject; empty where none was named."""
+    tokens = reading.tokens
+    values = set[int]().union(*found.values.values()) if found.values else set[int]()
+    subjects: list[tuple[int, int, frozenset[str]]] = []
+    number = 0
+    while number < len(tokens):
+        if not _subject(tokens, number, values):
+            number += 1
+            continue
+        first, last, robots = number, number, set(tokens[number].robots)
+        while True:
+            step = last + 1
+            while step < len(tokens) and tokens[step].text in _AND:
+                step += 1
+            if step == last + 1 or step >= len(tokens) or tokens[step].kind != "robot" or step in values:
+                break
+            robots |= set(tokens[step].robots)
+            last = step
+        subjects.append((first, last, frozenset(robots)))
+        number = last + 1
+    governs: list[frozenset[str]] = []
+    for index in range(len(tokens)):
+        earlier = [robots for _, last, robots in subjects if last <= index]
+        sentence = reading.sentence[index]
+        later = [
+            (first, robots) for first, _, robots in subjects if first > index and reading.sentence[first] == sentence
+        ]
+        meant = set(earlier[-1]) if earlier else set[str]()
+        if later and (not earlier or _trails(tokens, later[0][0])):
+            meant |= later[0][1]
+        governs.append(frozenset(meant))
+    return governs
+
+
+def _subject(tokens: tuple[Token, ...], number: int, values: set[int]) -> bool:
+    if tokens[number].kind != "robot" or number in values or not tokens[number].robots:
+        return False
+    if tokens[number].group == "any":
+        return False  # "could somebody fetch it": one of them, and not each
+    before = number - 1
+    while before >= 0 and tokens[before].text in ("the", "our", "my"):
+        before -= 1
+    return before < 0 or tokens[before].text not in _NOT_SUBJECT
+
+
+def _trails(tokens: tuple[Token, ...], first: int) -> bool:
+    """Whether a mention names who does what stands before it: at the end of its sentence, or after "with"."""
+    if first and tokens[first - 1].text in ("with", "using", "by", "via"):
+        return True
+    after = tokens[first + 1].text if first + 1 < len(tokens) else "."
+    return after in (".", "!", "?", ";", "\n")
 
 
 class Facts:
@@ -634,12 +725,17 @@ class Facts:
             listed: object = each.params.get("robots")
             names += [str(name) for name in listed] if isinstance(listed, list | tuple) else []  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
             names += [each.robot] if each.robot else []
-        return read(self.instruction, self.robots, names)
+        return read(self.instruction, self.robots, names, self.site)
 
     @cached_property
     def account(self) -> Account:
         """The plan, aligned with the words."""
         return account(self.reading, self.plan, self.catalogue, self.site)
+
+    @cached_property
+    def governors(self) -> list[frozenset[str]]:
+        """For each token the robots that may be its subject; empty where none was named."""
+        return _governors(self.reading, self.account)
 
     @cached_property
     def before(self) -> dict[str, set[str]]:

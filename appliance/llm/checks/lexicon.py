@@ -8,59 +8,6 @@ def _set(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-FILLERS = _set(
-    "sending having getting taking thx dear the a an my our your its his her their some of to at in on into onto "
-    "from with by near for via through inside towards toward until till upon there here then next after afterwards "
-    "before once when while whilst meanwhile and also too plus as so first firstly second secondly third thirdly "
-    "fourth finally lastly last subsequently please kindly pls plz thanks thank hey hi hello ok okay alright right "
-    "good now immediately straight directly just simply both each done finished finnished complete completed ready "
-    "arrived landed airborne it they he she you we i me us them him who which that this these those be been being "
-    "is are has have had do does did get got let make made making tell order command instruct send must shall will "
-    "should may need needs want like task job mission step steps everything following follows during same time "
-    "parallel simultaneously together respectively soon own one ones itself themselves robot proceed begin begins "
-    "start starts starting carry perform doing go execute sure ahead using use available fetch base gateway site "
-    "warehouse yard out over along across carefully safely another other locally local between among amongst "
-    "against but every all well copy roger break uh um er erm hm hmm cheers mister mate folks yourself yourselves "
-    "himself herself thereafter whereupon pronto asap i'd we'd you'd"
-)
-"""Words that may stand beside a plan without being in it."""
-FILLER_PHRASES = (
-    "good morning", "good afternoon", "good evening", "good day", "morning !", "morning ,", "evening !", "i . e", "i.e",
-    "i'd appreciate it if", "we'd appreciate it if", "it'd be good if", "it would be good if", "be so kind as to",
-    "make their way", "make its way", "make your way", "the way to", "hi there", "hello there", "hey there", "hey team",
-    "hi team",
-    "my friend", "hey buddy", "buddy", "pal", "lads", "colleague", "dear colleague", "so much", "very much", "ta",
-    "when you get a sec", "when you get a second", "when you get a moment", "when you get a minute", "is wanted at",
-    "is wanted in", "wants to be at", "wants to be in", "- >", "->", "when you're ready", "when you are ready",
-    "could you please", "would ROBOT mind", "mind sending", "mind flying", "mind driving", "mind going", "mind taking",
-    "mind moving", "mind bringing", "mind getting", "mind having",
-    "where it is", "where it stands", "where they are", "at the end", "in position", "has answered",
-    "have answered", "how many there are", "is answered", "no problem at all", "no problem", "no worries",
-    "no rush", "without exception", "if you would be so kind", "be so kind", "i would appreciate it if",
-    "we would appreciate it if", "excuse me", "would it be possible for you to", "how about you", "as you go",
-    "do n't forget to", "don't forget to", "do not forget to", "don't hesitate to",
-    "do not hesitate to", "i would like", "i'd like", "we would like", "we'd like", "would like you to",
-    "could you", "can you", "would you", "will you", "could somebody", "could someone", "can somebody",
-    "can someone", "would you mind", "would you please", "if you can", "if you please", "if you would",
-    "if you don't mind", "could you have", "can i have", "can we have", "could i have", "could we have",
-    "may i have", "i want", "i need", "we want", "we need", "make sure", "be sure", "in that order",
-    "in this order", "in order", "one after the other", "one by one", "right away", "right now", "straight away",
-    "at once", "as well", "all the way", "when you are done", "when you're done", "once you are done",
-    "once you're done", "that's", "it's", "it has", "they've", "let's", "you've", "you have", "in the meantime",
-    "at the same time", "as soon as", "thank you", "no hurry", "is to", "are to", "has to", "have to", "needs to",
-    "need to", "got to", "go ahead", "go and", "from there", "over there", "over here", "by the way", "for me",
-    "for us", "your job is", "on arrival", "upon arrival", "will do", "would be great", "would be nice",
-    "would be lovely", "would be much appreciated", "is much appreciated", "much appreciated", "when you like",
-    "if i may trouble you", "if i may", "if it's no trouble", "if it is no trouble", "if it's not too much trouble",
-    "if that's alright", "if that's ok", "if that's okay", "if that is ok", "if it pleases you",
-    "if you wouldn't mind", "be so good as to", "be good enough to", "be a dear and", "do me a favour and",
-    "do me a favor and", "followed by", "i'd love", "we'd love", "i would love", "i'd appreciate",
-    "i would appreciate", "we'd appreciate", "grateful if", "i'd be grateful if", "i would be grateful if",
-    "it'd be great if", "it would be great if", "it would be nice if", "i'd be glad if", "i'd be happy if",
-    "having got there", "having arrived", "the next job for", "the next task for", "next job for", "next task for",
-    "the job for", "is to be", "ought to", "as a next step", "could you please",
-)  # fmt: skip
-"""Runs of words (ROBOT: a mention of robots) that may stand beside a plan without being in it."""
 NEGATIONS = _set(
     "not no never none nobody nothing neither nor without avoid avoiding refuse refrain refraining cancel skip omit "
     "forget don't dont doesn't doesnt didn't shouldn't shouldnt mustn't mustnt can't cant cannot won't wont "
@@ -161,5 +108,31 @@ NOUNS_TOO = _set(
 """Such words that stand in names, too: the stop sign, Mr Halt."""
 AWAY = frozenset((("away", "from"), ("out", "of"), ("clear", "of"), ("far", "from"), ("off", "of"), ("back", "from")))
 """Words before a place that a robot is to leave."""
+NUMBERED = _set(
+    "dock docks goal goals bay bays aisle aisles waypoint waypoints station stations shelf shelves rack racks gate "
+    "gates room rooms table tables number no nr point points slot slots zone zones area areas"
+)
+"""Nouns behind which a figure is a number, and counts nothing."""
 GUARDS = (NEGATIONS | CONDITIONS | EXCEPTIONS | ALTERNATIVES | CORRECTIONS | SEQUENCE | SIDE_BY_SIDE) - NOUNS_TOO
 """Words that no name of a thing or place accounts for."""
+NO_NAME = _set(
+    "it this that these those which what who whom whose whatever whichever whoever latter former same other others "
+    "another one ones any anything some something someone somebody everything nothing nobody rest remainder thing "
+    "things stuff whatsit thingy gizmo someplace somewhere anywhere elsewhere everywhere "
+    "mark signal cue command say-so care charge turn chance moment while future "
+    "come comes coming monday tuesday wednesday thursday friday saturday sunday today tomorrow tonight yesterday "
+    "noon midnight later soon ago next last previous usual "
+    "not never no without unless except forget forgot asked wait oops argh ugh sorry please thanks"
+)
+"""Words that are part of no name: a value with one of them says nothing, or has taken in words that mean more."""
+MANNER = _set(
+    "upside upright backwards backward forwards forward sideward sidewards inwards outwards upwards downwards aloud "
+    "alone together apart headfirst feet-first face-down fast slow hard soft loud quiet tight loose straight"
+)
+"""Words that say how something is done, and name nothing."""
+NOUNS_IN_LY = _set(
+    "assembly supply family dolly trolly gully jelly belly lily lolly bully anomaly fly ply butterfly monopoly"
+)
+"""Nouns that look like adverbs."""
+ORDINALS = _set("second third fourth fifth sixth seventh eighth ninth tenth")
+COUNTS = _set("two three four five six seven eight nine ten dozen hundred thousand several many few couple")

@@ -13,7 +13,7 @@ from functools import lru_cache
 from msgspec import Struct, field
 
 from appliance.llm.words import singular
-from appliance.model import RobotInfo
+from appliance.model import RobotInfo, Site
 
 MAX_TOKENS = 4000
 """Longer texts are cut: `preprocessing` refuses them before."""
@@ -80,10 +80,11 @@ _GROUP = frozenset(("all", "both", "every", "each"))
 _EVERYBODY = frozenset(("everyone", "everybody"))
 _SOMEBODY = frozenset(("somebody", "someone", "anyone", "anybody"))
 _ONE_OF = frozenset(("a", "an", "any", "one", "some", "another", "whichever", "either"))
+_ONLY_ONE = frozenset(("a", "an", "one", "another", "either"))
 _BETWEEN = frozenset(("of", "the", "our", "my", "your", "available", "free", "idle", "nearest", "closest", "other"))
+_QUOTE = r"\"[^\"\n]{0,400}\"|“[^”\n]{0,400}”|«[^»\n]{0,400}»|„[^“”\n]{0,400}[“”]|(?<!\w)['‘][^'’\n]{0,400}['’](?!\w)"
 _TOKEN = re.compile(
-    r"(?P<quote>\"[^\"\n]{0,400}\"|“[^”\n]{0,400}”|«[^»\n]{0,400}»|„[^“”\n]{0,400}[“”]"
-    r"|(?<!\w)['‘][^'’\n]{0,400}['’](?!\w))"
+    rf"(?P<quote>{_QUOTE})"
     r"|(?P<number>(?<![\w.)])[-−]\d+(?:[.,]\d+)*|\d+(?:[.,]\d+)*)"
     r"|(?P<word>[^\W\d_]+(?:['’][^\W\d_]+)*)"
     r"|(?P<mark>[^\w\s]|_|\n)"
@@ -106,6 +107,10 @@ class Token(Struct, frozen=True):
     """Of a mention of robots: which of the roster it can mean."""
     group: str = ""
     """Of a mention: `one` (by name), `all` (all of `robots`), `any` (one of them)."""
+    count: int = 0
+    """Of a mention without names: how many robots the words say, "both" being two; 0 where they do not."""
+    listed: bool = False
+    """Of a mention: whether the words list its robots by number ("rovers 1 and 2")."""
 
 
 class Reading(Struct, frozen=True, kw_only=True):
@@ -127,6 +132,57 @@ class Reading(Struct, frozen=True, kw_only=True):
     def named(self) -> frozenset[str]:
         """Robots that the words name or imply."""
         return frozenset(robot for each in self.tokens if each.group in ("one", "all") for robot in each.robots)
+
+
+_SHORT = tuple(
+    (re.compile(short, re.IGNORECASE), long)
+    for short, long in (
+        (r"(?<=\s)[&+](?=\s)|(?<=\s)n(?=\s+[^\W\d_])", "and"),
+        (r"(?<=\s)@(?=\s+[^\W\d_])", "at"),
+        (r"(?<=[^\W\d_]\s)x ?(\d{1,2})(?=\s*(?:[,.;!?]|$|(?:and|then)\b))(?!\s*,?\s*(?:and )?y\b)", r"\1 times"),
+        (r"(?<!\w)u(?!\w)", "you"),
+        (r"(?<!\w)thats(?!\w)", "that's"),
+        (r"\s*(?::-?\)|[🙂😀😃😄😊👍🙏👋])(?=\s|$)", ""),
+    )
+)
+"""Signs and letters of chat, and what they are short for."""
+_QUOTED = re.compile(_QUOTE)
+_SHORT_PART = re.compile(r"(?<![^\W\d_])(?:[nux]|thats)(?![^\W\d_])|[^\w\s.\-]", re.IGNORECASE)
+"""What a name must have for shorthand to be found in it."""
+
+
+def spelled(text: str, known: Iterable[str] = ()) -> str:
+    """Return a text without the shorthand of chat: "rover_1 & rover_2", "photo x3", "all of u".
+
+    Args:
+        text: as it was typed.
+        known: names of robots, places and objects; they stay as they are ("bay x3", "unit n"), and so do quotations.
+    """
+    if not any(short.search(text) for short, _ in _SHORT):
+        return text
+    names = _kept(tuple(sorted({each for each in known if _SHORT_PART.search(each)})))
+    for short, long in _SHORT:
+        kept = [each.span() for pattern in (_QUOTED, names) if pattern for each in pattern.finditer(text)]
+
+        def written_out(found: re.Match[str], long: str = long, kept: list[tuple[int, int]] = kept) -> str:
+            inside = any(found.start() < end and start < found.end() for start, end in kept)
+            return found.group() if inside else found.expand(long)
+
+        text = short.sub(written_out, text)
+    return text
+
+
+@lru_cache(maxsize=256)
+def _kept(names: tuple[str, ...]) -> re.Pattern[str] | None:
+    """The pattern of names in a text: as they are written, or with other signs between their parts ("unit n 1")."""
+    spellings: set[str] = set()
+    for name in names:
+        spellings.add(r"\s+".join(map(re.escape, name.split())))
+        parts = _parts(name)
+        if re.sub(r"[\s_.\-]", "", name).casefold() == "".join(parts):
+            spellings.add(r"[\s_.\-]*".join(map(re.escape, parts)))
+    longest_first = sorted(filter(None, spellings), key=lambda each: (-len(each), each))
+    return re.compile(rf"(?<!\w)(?:{'|'.join(longest_first)})(?!\w)", re.IGNORECASE) if longest_first else None
 
 
 @lru_cache(maxsize=64)
@@ -152,16 +208,25 @@ def stem(word: str) -> str:
     return singular(word) if len(word) > 3 else word
 
 
-def read(instruction: str, robots: Sequence[RobotInfo] | None, names: Iterable[str] = ()) -> Reading:
+def read(
+    instruction: str, robots: Sequence[RobotInfo] | None, names: Iterable[str] = (), site: Site | None = None
+) -> Reading:
     """Read an instruction; the reading is kept for the next plan of the same words and robots.
 
     Args:
         instruction: as it was typed.
         robots: the roster; None when it is unknown.
         names: robots that a plan names, which count as names where the roster is unknown.
+        site: names of its places and objects are no shorthand.
     """
     roster = None if robots is None else tuple((each.id, each.flies) for each in robots)
-    return _read(instruction, roster, tuple(sorted(set(names))) if robots is None else ())
+    known = tuple(sorted(set(names))) if robots is None else ()
+    return _read(spelled(instruction, (*known, *names_of(robots, site))), roster, known)
+
+
+def names_of(robots: Iterable[RobotInfo] | None, site: Site | None) -> tuple[str, ...]:
+    """Names of robots, and of what a site has."""
+    return (*(each.id for each in robots or ()), *(site.names if site is not None else ()))
 
 
 @lru_cache(maxsize=32)
@@ -209,9 +274,17 @@ def _scripts(word: str) -> int:
     return len({unicodedata.name(each, "?").split()[0] for each in word if each.isalpha()})
 
 
+@lru_cache(maxsize=32_768)
 def _parts(robot: str) -> tuple[str, ...]:
-    """The parts of a robot's id as tokens are: letters and digits apart."""
-    return tuple(re.findall(r"[^\W\d_]+|\d+", robot.casefold()))
+    """The parts of a robot's id as tokens are: letters and numbers apart."""
+    return tuple(re.findall(r"[^\W\d_]+|\d+(?:[.,]\d+)*", robot.casefold()))
+
+
+@lru_cache(maxsize=32_768)
+def is_readable(robot: str) -> bool:
+    """Whether a reading finds this id where it stands in a text by itself."""
+    found = _named([_token(match) for match in _TOKEN.finditer(normalise(robot)[0])], (robot,))
+    return len(found) == 1 and found[0].group == "one"
 
 
 def _named(tokens: list[Token], known: Sequence[str]) -> list[Token]:
@@ -265,6 +338,7 @@ _Robot = tuple[str, bool]
 """Id, and whether it flies."""
 
 
+@lru_cache(maxsize=32_768)
 def _kind_of(robot: str) -> str:
     """The noun in a robot's id: `drone` of drone_3; empty when there is none."""
     return next((part for part in _parts(robot) if part in KINDS), "")
@@ -302,9 +376,14 @@ def _group(
     roster = tuple(robots or ())
     everyone = tuple(name for name, _ in roster)
 
-    def made(stop: int, which: tuple[str, ...], group: str) -> tuple[int, Token]:
+    def made(
+        stop: int, which: tuple[str, ...], group: str, *, count: float | None = None, listed: bool = False
+    ) -> tuple[int, Token]:
         text = " ".join(each.text for each in tokens[at:stop])
-        return stop, Token(text, "robot", token.start, tokens[stop - 1].end, robots=which, group=group)
+        said = int(count) if count is not None and count == int(count) else 0
+        return stop, Token(
+            text, "robot", token.start, tokens[stop - 1].end, robots=which, group=group, count=said, listed=listed
+        )
 
     if token.text in _EVERYBODY | _SOMEBODY:
         return made(at + 1, everyone, "all" if token.text in _EVERYBODY else "any")
@@ -333,46 +412,89 @@ def _group(
         return made(index + 1, earlier or everyone, "all")
     if kind in KINDS and noun != kind and (found := _listed(tokens, index + 1, kind, roster)):
         stop, which = found
-        return made(stop, which, "all")
+        return made(stop, which, "all", listed=True)
     numbered = index + 1 < len(tokens) and (tokens[index + 1].value is not None or tokens[index + 1].text in ("_", "-"))
     if kind in KINDS and not numbered:
         which = _of_kind(kind, roster)
-        if other:
-            named = {robot for each in before if each.group == "one" for robot in each.robots}
-            which = tuple(each for each in which if each not in named)
-        group = _meant(lead, count, plural=noun != kind, number=len(which))
+        which = (_others(which, tokens) or _others(which, before)) if other else which
+        count = 2.0 if lead == "both" and count is None else count
+        which = _of_those(which, before, lead, count)
+        plural = noun not in (kind, "one")  # "the other one" is one
+        group = _meant(lead, count, plural=plural, number=len(which))
         if not group and not lead and len(which) == 1 and (not before or before[-1].text in _STARTS):
             group = "one"
+        count = 1.0 if count is None and group == "any" and (not plural or lead in _ONLY_ONE) else count
         if group:
-            return made(index + 1, which, group)
+            return made(index + 1, which, group, count=count)
     if lead == "both" and index == at + 1 and len(everyone) == 2 and noun not in KINDS:
         return made(at + 1, everyone, "all")
     return at, None
 
 
+def _others(which: tuple[str, ...], tokens: Sequence[Token]) -> tuple[str, ...]:
+    """The robots that are not among those that tokens name."""
+    named = {robot for each in tokens if each.group == "one" for robot in each.robots}
+    return tuple(each for each in which if each not in named)
+
+
+def _of_those(which: tuple[str, ...], before: Sequence[Token], lead: str, count: float | None) -> tuple[str, ...]:
+    """The robots that "both drones" and "all three robots" mean: of more than so many, those that were named before."""
+    if lead not in _GROUP or count is None or len(which) == count:
+        return which
+    named = {robot for each in before if each.group == "one" or each.listed for robot in each.robots}
+    those = tuple(each for each in which if each in named)
+    return those if len(those) == count else which
+
+
 def _listed(
     tokens: Sequence[Token], at: int, kind: str, roster: Sequence[_Robot]
 ) -> tuple[int, tuple[str, ...]] | None:
-    """The robots of "rovers 1, 2 and 3", and the index behind them; None when there are fewer than two numbers."""
+    """The robots of "rovers 1, 2 and 4 to 6", and the index behind them; None when there are fewer than two numbers."""
     numbers: list[float] = []
     index = stop = at
+    ranged = False
     while index < len(tokens):
         value = tokens[index].value
         if value is not None and (not numbers or index > stop):
+            low = numbers[-1] if numbers else value
+            if ranged and not _range(tokens, index, low, value):
+                break
+            numbers += [float(each) for each in range(int(low) + 1, int(value))] if ranged else []
             numbers.append(value)
-            stop = index + 1
-        elif not numbers or tokens[index].text not in (",", "and", "&", "plus"):
+            stop, ranged = index + 1, False
+        elif not numbers or tokens[index].text not in (",", "and", "&", "plus", *_TO):
             break
+        elif tokens[index].text in _TO:
+            # "drones 1 and 2 to 10 m": only what begins the list is a range in words.
+            if ranged or index != stop or (tokens[index].kind == "word" and len(numbers) > 1):
+                break
+            ranged = True
         index += 1
-    names = {f"{kind}_{number:g}" for number in numbers} | {f"{kind}{number:g}" for number in numbers}
+    wanted = dict.fromkeys(numbers)
+    names = {f"{kind}_{number:g}" for number in wanted} | {f"{kind}{number:g}" for number in wanted}
     which = tuple(name for name, _ in roster if name in names)
-    return (stop, which) if len(numbers) > 1 and len(which) == len(numbers) else None
+    return (stop, which) if len(wanted) > 1 and len(which) == len(wanted) else None
+
+
+def _range(tokens: Sequence[Token], end: int, low: float, high: float) -> bool:
+    """Whether a second figure is the last of some numbers, and no quantity: "drones 4 to 6", not "drone 4 to 6 m"."""
+    after = tokens[end + 1].text if end + 1 < len(tokens) else ""
+    whole = low == int(low) and high == int(high)
+    return whole and 0 < high - low <= _LONGEST_RANGE and after not in _UNITS
+
+
+_UNITS = frozenset((
+    "m", "km", "cm", "ft", "metre", "metres", "meter", "meters", "foot", "feet", "s", "sec", "second", "seconds", "min",
+    "minute", "minutes", "h", "hour", "hours", "lap", "laps", "time", "times", "degree", "degrees", "percent", "%", "°",
+))  # fmt: skip
+_TO = frozenset(("to", "through", "thru", "-", "–"))
+_LONGEST_RANGE = 256
 
 
 def _meant(lead: str, count: float | None, *, plural: bool, number: int) -> str:
     """Whether a noun for robots means `all` of its kind, `one` that is clear, or `any`; empty when it means none."""
     if lead in _GROUP:
-        return "all"
+        return "all"  # "all five drones" of two: `robots.group_size` holds the plan
     if plural:
         return "all" if count == number or (count is None and lead in ("the", "")) else "any"
     if lead == "the":

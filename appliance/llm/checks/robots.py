@@ -4,33 +4,13 @@ from collections.abc import Iterable
 
 from appliance.llm.checks import lexicon as lx
 from appliance.llm.checks.facts import Facts
-from appliance.llm.checks.reading import Token
 from appliance.llm.checks.safety import robots_of
 from appliance.llm.checks.schema import able, is_unnamed
-from appliance.llm.checks.wording import forbidden
+from appliance.llm.checks.wording import forbidden, side_by_side
 from appliance.model import Finding, Severity, Subtask
 
-_NOT_SUBJECT = frozenset(
-    (
-        "to",
-        "follow",
-        "follows",
-        "following",
-        "towards",
-        "toward",
-        "behind",
-        "beside",
-        "near",
-        "from",
-        "at",
-        "meet",
-        "around",
-    )
-)
-"""Words before a robot that is no subject: "give the box to rover_2"."""
 _ELLIPSIS = frozenset(("does", "do", "same", "likewise", "too"))
 """Words that give another robot what was said before: "rover_1 goes to dock 3 while rover_2 does"."""
-_JOIN = frozenset((",", "and", "&", "plus"))
 _INSTRUMENT = frozenset(("with", "using", "by", "via", "have", "let", "send", "get", "tell", "ask", "make"))
 
 
@@ -93,7 +73,7 @@ def _covered_by_named(facts: Facts, robot: str) -> bool:
 
 
 def flies(facts: Facts) -> Iterable[Finding]:
-    """No robot is told to fly that does not fly."""
+    """No robot gets an order to fly that does not fly."""
     flying = {each.id: each.flies for each in facts.robots or ()}
     tokens = facts.reading.tokens
     for number, token in enumerate(tokens[1:], start=1):
@@ -117,6 +97,10 @@ def idle_robot(facts: Facts) -> Iterable[Finding]:
     busy = {robot for each in facts.plan.subtasks for robot in robots_of(each)}
     values = set[int]().union(*facts.account.values.values()) if facts.account.values else set[int]()
     skip = values | forbidden(facts)
+    quoted = any(each.kind == "quote" for each in facts.reading.tokens)
+    manifests = [None if each.robot is not None else facts.manifest(each) for each in facts.plan.subtasks]
+    if quoted and all(each is not None and each.reports for each in manifests):
+        return  # the gateway passes on what stands in quotation marks, whichever robot is addressed
     idle = {
         robot
         for number, each in enumerate(facts.reading.tokens)
@@ -137,8 +121,8 @@ def assignment(facts: Facts) -> Iterable[Finding]:
     """Each robot does what the words give to it, not what they give to another."""
     if facts.continued:
         return
-    governs = _governors(facts)
-    if not any(governs) or any(each.text in _ELLIPSIS for each in facts.reading.tokens):
+    governs = facts.governors
+    if not any(governs) or any(_elliptic(facts, number) for number in range(len(facts.reading.tokens))):
         return
     for subtask in facts.plan.subtasks:
         robot = subtask.robot
@@ -163,6 +147,16 @@ def assignment(facts: Facts) -> Iterable[Finding]:
                 check="assignment", severity=Severity.HOLD,
                 message=f"{subtask.id} ({subtask.skill}) is given to {robot}, and the words give it to {who}",
             )  # fmt: skip
+
+
+def _elliptic(facts: Facts, number: int) -> bool:
+    """Whether a word gives the robot before it what was said of another: nothing of its own is said between."""
+    tokens = facts.reading.tokens
+    if tokens[number].text not in _ELLIPSIS or side_by_side(tokens, number + 1):
+        return False
+    robot = next((each for each in range(number, -1, -1) if tokens[each].kind == "robot"), -1)
+    said = facts.account.values.values()
+    return not any(robot < index < number for each in said for index in each)
 
 
 def _of_verb(facts: Facts, subtask: Subtask, robot: str, index: int) -> bool:
@@ -195,7 +189,7 @@ def each_of_group(facts: Facts) -> Iterable[Finding]:
     """What is asked of several robots together is done by each of them."""
     if facts.continued or any(each.text in _DIVIDED for each in facts.reading.tokens):
         return
-    governs = _governors(facts)
+    governs = facts.governors
     for subtask in facts.plan.subtasks:
         manifest = facts.manifest(subtask)
         if manifest is None or manifest.joint or subtask.robot is None or subtask.id in facts.added:
@@ -220,55 +214,55 @@ _DIVIDED = frozenset(("one", "other", "respectively", "between", "another", "dif
 """Words by which each robot of several has a job of its own."""
 
 
-def _governors(facts: Facts) -> list[frozenset[str]]:
-    """For each token the robots that may be its subject; empty where none was named."""
+def group_size(facts: Facts) -> Iterable[Finding]:
+    """As many robots as the words say: "both drones" are two, "all four" are four, "a drone" is one."""
+    if facts.robots is None or facts.continued:
+        return
     tokens = facts.reading.tokens
-    values = set[int]().union(*facts.account.values.values()) if facts.account.values else set[int]()
-    subjects: list[tuple[int, int, frozenset[str]]] = []
-    number = 0
-    while number < len(tokens):
-        if not _subject(tokens, number, values):
-            number += 1
+    for each, link, end in zip(tokens, tokens[1:], tokens[2:], strict=False):
+        if each.group == "all" and link.text in _RANGE and end.group == "one" and set(end.robots) <= set(each.robots):
+            words = f"{each.text} {link.text} {end.text}"
+            yield Finding(
+                check="quantity", severity=Severity.HOLD, words=(words,),
+                message=f'"{words}" may mean some of them', hint="name each robot",
+            )  # fmt: skip
+            return
+    for each in tokens:
+        state = _STATES.intersection(each.text.split())
+        if each.kind != "robot" or len(each.robots) < 2 or not state:
             continue
-        first, last, robots = number, number, set(tokens[number].robots)
-        while True:
-            step = last + 1
-            while step < len(tokens) and tokens[step].text in _JOIN:
-                step += 1
-            if step == last + 1 or step >= len(tokens) or tokens[step].kind != "robot" or step in values:
-                break
-            robots |= set(tokens[step].robots)
-            last = step
-        subjects.append((first, last, frozenset(robots)))
-        number = last + 1
-    found: list[frozenset[str]] = []
-    for index in range(len(tokens)):
-        earlier = [robots for _, last, robots in subjects if last <= index]
-        sentence = facts.reading.sentence[index]
-        later = [
-            (first, robots)
-            for first, _, robots in subjects
-            if first > index and facts.reading.sentence[first] == sentence
-        ]
-        meant = set(earlier[-1]) if earlier else set[str]()
-        if later and (not earlier or _trails(tokens, later[0][0])):
-            meant |= later[0][1]
-        found.append(frozenset(meant))
-    return found
+        # One that is free is what placement takes; one that is near is not, and of several each is commanded.
+        if each.group == "all" or not _FREE.issuperset(state):
+            yield Finding(
+                check="quantity", severity=Severity.HOLD, words=(each.text,),
+                message=f'"{each.text}": which robots they are is known only when the plan runs',
+                hint="name each robot; swiftbot robots shows where they are and what they do",
+            )  # fmt: skip
+            return
+    mentions = [each for each in tokens if each.kind == "robot" and each.robots and each.count]
+    for each in mentions:
+        if each.group == "all" and not each.listed and len(each.robots) != each.count:
+            yield Finding(
+                check="quantity", severity=Severity.HOLD, words=(each.text,),
+                message=f'"{each.text}": the fleet has {len(each.robots)} of them', hint="name each robot",
+            )  # fmt: skip
+            return
+    named = facts.reading.named
+    for meant in dict.fromkeys(each.robots for each in mentions if each.group == "any"):
+        most = sum(each.count for each in mentions if each.group == "any" and set(each.robots) & set(meant))
+        doing = [each for each in _planned(facts) if each in meant and each not in named]
+        if len(doing) > most:
+            text = next(each.text for each in mentions if each.robots == meant)
+            yield Finding(
+                check="quantity", severity=Severity.HOLD, words=(text,),
+                message=f'"{text}": the plan has {len(doing)} of them do it: {", ".join(doing[:8])}',
+                hint="name each robot",
+            )  # fmt: skip
+            return
 
 
-def _subject(tokens: tuple[Token, ...], number: int, values: set[int]) -> bool:
-    if tokens[number].kind != "robot" or number in values or not tokens[number].robots:
-        return False
-    before = number - 1
-    while before >= 0 and tokens[before].text in ("the", "our", "my"):
-        before -= 1
-    return before < 0 or tokens[before].text not in _NOT_SUBJECT
-
-
-def _trails(tokens: tuple[Token, ...], first: int) -> bool:
-    """Whether a mention names who does what stands before it: at the end of its sentence, or after "with"."""
-    if first and tokens[first - 1].text in ("with", "using", "by", "via"):
-        return True
-    after = tokens[first + 1].text if first + 1 < len(tokens) else "."
-    return after in (".", "!", "?", ";", "\n")
+_FREE = frozenset(("available", "free", "idle"))
+_STATES = _FREE | {"nearest", "closest"}
+"""Words that choose robots by what they do or where they are."""
+_RANGE = frozenset(("from", "to", "through", "thru", "until", "till"))
+"""Words between a group and the robots with which a part of it begins or ends: "all drones from drone_2 to drone_4"."""

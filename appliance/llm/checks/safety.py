@@ -34,7 +34,7 @@ _LIMITS = (("altitude_m", "m", "altitude"), ("speed_mps", "m/s", "speed"), ("dur
 
 
 class _Goal(NamedTuple):
-    """Where a subtask goes: as names are compared, and as it is told."""
+    """Where a subtask goes: as names are compared, and as messages name it."""
 
     name: str
     said: str
@@ -60,6 +60,7 @@ def unsafe(plan: Plan, context: PlanContext, catalogue: Catalogue, config: Safet
 def _subtask(subtask: Subtask, context: PlanContext, catalogue: Catalogue, config: SafetyConfig) -> Iterable[str]:
     if pattern := matched(subtask.skill, config.skills_never):
         yield f"the policy forbids the skill (safety.skills_never: {pattern}): leave it out"
+    yield from (f"{text}: choose another, or wait" for text in out_of_use(subtask, context, catalogue))
     goals = _goals(subtask, catalogue)
     homes = _homes(subtask, context, catalogue)
     for goal in (*goals, *homes.values()):
@@ -136,6 +137,18 @@ def _candidates(subtask: Subtask, robots: Sequence[RobotInfo] | None, catalogue:
         manifest = catalogue.skills.get(subtask.skill)
         found += [each.id for each in robots or () if manifest is None or not able(each, manifest)]
     return sorted(set(found))
+
+
+def out_of_use(subtask: Subtask, context: PlanContext, catalogue: Catalogue) -> Iterable[str]:
+    """Yield the closed places that a robot goes to for a subtask, and those of its robots that are in maintenance."""
+    closed = context.out_of_use
+    for robot in sorted(robots_of(subtask) & set(closed.robots)):
+        yield f"{robot} is {closed.robots[robot]}"
+    if subtask.robot is None or not closed.places:
+        return
+    for goal in dict.fromkeys((*_goals(subtask, catalogue), *_homes(subtask, context, catalogue).values())):
+        if (place := next((each for each in known_as(goal.name, context.site) if each in closed.places), "")) != "":
+            yield f"{goal.said} is {closed.places[place]}"
 
 
 def _exclusive(plan: Plan, context: PlanContext, catalogue: Catalogue, config: SafetyConfig) -> Iterable[str]:
@@ -264,7 +277,7 @@ _TOKEN = re.compile(r"[a-z]+|\d+")
 _PLAIN = frozenset({
     "operator", "home", "base", "me", "us", "team", "all", "any", "here", "start", "area", "result", "results",
 })  # fmt: skip
-"""What a plan may say of its own accord: whoever gave the order, where a robot came from, what is reported."""
+"""What a plan may say of its own accord: who gave the order, where a robot came from, what is reported."""
 _GROUP = frozenset({
     "all", "both", "every", "everyone", "everybody", "each", "any", "robots", "robot", "team", "fleet", "they", "them",
     "you", "others", "other", "rest", "two", "three", "four", "five", "six", "pair", "units", "unit", "crew", "drones",

@@ -131,7 +131,11 @@ def _params(subtask: Subtask, manifest: SkillManifest) -> Iterable[str]:
         if name not in manifest.params:
             known = ", ".join(manifest.params) or "none"
             yield f"there is no parameter {shown(name)}: {manifest.id} has {known}"
-        elif wrong := _wrong_type(value, manifest.params[name]) or _wrong_value(name, value):
+        elif wrong := (
+            _wrong_type(value, manifest.params[name])
+            or _out_of_bounds(value, manifest.params[name])
+            or _wrong_value(name, value)
+        ):
             yield f"parameter {name}: {wrong}"
 
 
@@ -153,6 +157,14 @@ def _wrong_type(value: Any, param: Param) -> str:
     elif param.type == "integer" and value != int(value):
         return f"must be a whole number, not {value}"
     return ""
+
+
+def _out_of_bounds(value: Any, param: Param) -> str:
+    if not isinstance(value, int | float):
+        return ""
+    if param.least is not None and value < param.least:
+        return f"is {value}: at least {param.least:g}"
+    return f"is {value}: at most {param.most:g}" if param.most is not None and value > param.most else ""
 
 
 def _within(value: float) -> bool:

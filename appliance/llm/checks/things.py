@@ -1,10 +1,13 @@
 """Checks of things: what is picked up is known to the site, and the robot goes to where it is. Pure."""
 
-from collections.abc import Iterable
+import math
+import re
+from collections.abc import Iterable, Sequence
 
 from appliance.llm.checks import lexicon as lx
-from appliance.llm.checks.facts import Facts
-from appliance.llm.checks.reading import stem
+from appliance.llm.checks.facts import Facts, text_said
+from appliance.llm.checks.places import bare, locate, nearest, parts_of
+from appliance.llm.checks.reading import Token, stem
 from appliance.model import Finding, Severity, Site, SiteObject, Subtask
 from appliance.skills.catalogue import SkillManifest
 
@@ -164,3 +167,146 @@ def unknown_thing(facts: Facts) -> Iterable[Finding]:
 def _like(name: str, other: str) -> bool:
     one, two = ({stem(word) for word in each.lower().split()} for each in (name, other))
     return one == two or two <= one
+
+
+def odd_names(facts: Facts) -> Iterable[Finding]:
+    """What a plan names has a name: of the site, in quotation marks, or of words that can be one."""
+    spoken = {each.text.lower() for each in facts.reading.tokens if each.kind == "quote"}
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        if manifest is None or subtask.id in facts.added:
+            continue
+        for key, value in subtask.params.items():
+            if key in _SPOKEN or not isinstance(value, str) or value.lower() in spoken or _site_has(facts.site, value):
+                continue
+            words = value.lower().split() or [""]
+            one = key == "object" and ("load" in manifest.ties or "load" in manifest.frees)
+            if any(word in lx.NO_NAME or _adverb(word) for word in words) or (
+                one and (words[0] in lx.ORDINALS or _many(words[0]))
+            ):
+                yield Finding(
+                    check="names", severity=Severity.HOLD, words=(value,),
+                    message=f'{subtask.id}: "{value}" is no name of a {key}', hint="name it as the site does",
+                )  # fmt: skip
+
+
+def counted(facts: Facts) -> Iterable[Finding]:
+    """A robot takes, puts down or gives one thing: the words say of no object that there are several."""
+    tokens = facts.reading.tokens
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        value = subtask.params.get("object")
+        load = manifest is not None and ("load" in manifest.ties or "load" in manifest.frees)
+        if not load or not isinstance(value, str) or subtask.id in facts.added:
+            continue
+        said = text_said(facts.reading, value, None) or set()
+        for first in sorted(index for index in said if index - 1 not in said):
+            before = first - 1
+            while before > 0 and tokens[before].text in _DETERMINERS:
+                before -= 1
+            last = first
+            while last + 1 in said:
+                last += 1
+            listed = last + 1 < len(tokens) and tokens[last + 1].text in ("and", "&")
+            several = next((at for at in (before, first) if _several(tokens, at, listed=listed)), None)
+            if several is not None:
+                word = tokens[several].text
+                yield Finding(
+                    check="quantity", severity=Severity.HOLD, words=(word,),
+                    message=f'{subtask.id} ({subtask.skill} {value}): the words say "{word}", and it handles one thing',
+                    hint="give each thing an order of its own",
+                )  # fmt: skip
+                break
+
+
+_DETERMINERS = frozenset(("of", "the", "our", "my", "your", "those", "these", "them"))
+
+
+def _several(tokens: Sequence[Token], at: int, *, listed: bool) -> bool:
+    """Whether a token says that what follows it is more than one thing; `listed`: "and" and another follow."""
+    if at < 0 or (at and tokens[at - 1].text in lx.NUMBERED):
+        return False
+    token = tokens[at]
+    if token.text in ("all", "every", "each"):
+        return True
+    if token.text == "both":
+        return not listed
+    return token.kind in ("word", "number") and (
+        token.text in lx.COUNTS or (token.value is not None and token.value > 1)
+    )
+
+
+def unknown_place(facts: Facts) -> Iterable[Finding]:
+    """Where something is done is a place, a thing or a coordinate of the site."""
+    site = facts.site
+    if site is None:
+        return
+    for subtask in facts.plan.subtasks:
+        manifest = facts.manifest(subtask)
+        for key, value in subtask.params.items():
+            param = manifest.params.get(key) if manifest is not None else None
+            if param is None or (param.names != "place" and key != "path") or not isinstance(value, str):
+                continue
+            parts = [each for part in parts_of(value) if (each := _ROUTE.sub("", part)) or key != "path"]
+            there = [locate(each, site) is not None or _site_has(site, each) for each in parts]
+            # Of a route each stop is a place; the route's own name is none of them.
+            if not (all(there[1:]) if key == "path" and len(parts) > 2 else any(there)):
+                like = nearest(value, site)
+                yield Finding(
+                    check="unknown_place", severity=Severity.HOLD, words=(value,),
+                    message=f'{subtask.id}: the site knows no place "{value}"',
+                    hint=f"nearest name: {like}" if like else f"it knows {', '.join(sorted(site.places)[:8])}",
+                )  # fmt: skip
+
+
+_ROUTE = re.compile(r"^(?:the )?(?:path|route|way)\b ?")
+"""What stands before the first place of a route."""
+_POINT = re.compile(
+    r"([\w .-]{1,60}?)\s*\(\s*(-?\d{1,6}(?:\.\d+)?)\s*[,;]\s*(-?\d{1,6}(?:\.\d+)?)\s*(?:m|metres|meters)?\s*\)"
+)
+
+
+def other_point(facts: Facts) -> Iterable[Finding]:
+    """A coordinate in brackets behind a place is that place: "goal 1 (28, 5)"."""
+    site = facts.site
+    if site is None:
+        return
+    for found in _POINT.finditer(facts.reading.text.lower()):
+        words = found.group(1).split()
+        place = next((known for size in (3, 2, 1) if (known := site.find(" ".join(words[-size:]))) is not None), None)
+        if place is None:
+            continue
+        away = math.hypot(place.x - float(found.group(2)), place.y - float(found.group(3)))
+        if away > REACH_M:
+            said = found.group().strip()
+            yield Finding(
+                check="names", severity=Severity.HOLD, words=(said,),
+                message=f'"{said}": the place is at ({place.x:g}, {place.y:g})', hint="name the place, or the point",
+            )  # fmt: skip
+
+
+def _adverb(word: str) -> bool:
+    """Whether a word says how something is done: "sideways", "diagonally"."""
+    return word in lx.MANNER or word.endswith(("wise", "ways")) or (word.endswith("ly") and word not in lx.NOUNS_IN_LY)
+
+
+_SPOKEN = frozenset(("text", "question", "event", "instruction", "prompt"))
+"""Parameters that are said, not names."""
+
+
+def _many(word: str) -> bool:
+    return word in lx.COUNTS or (word.isdigit() and int(word) > 1)
+
+
+def _names(site: Site) -> list[str]:
+    names = [each.name for each in (*site.doors, *site.devices, *site.objects)]
+    names += [site.fence.name] if site.fence is not None else []
+    return names + [name for key, place in site.places.items() for name in (key, *place.aliases)]
+
+
+def _site_has(site: Site | None, name: str) -> bool:
+    return site is not None and (
+        locate(name, site) is not None
+        or known_thing(name, site) is not None
+        or bare(name) in {each.lower() for each in _names(site)}
+    )

@@ -2,19 +2,21 @@
 
 A plan runs unasked only where it accounts for all that was typed. What changes the meaning of an order (negation,
 exception, condition, time, alternative, correction, question) has a check of its own, so that a refusal names the real
-reason; all other words that are left over are found by `coverage`, and subtasks that no words ask for by `polarity`.
+reason; all other words that are left over have to be derivable by the grammar of `clauses` (`coverage`), and subtasks
+that no words ask for are found by `polarity`.
 """
 
 import re
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
+from itertools import pairwise
 
+from appliance.llm.checks import clauses, schedules
 from appliance.llm.checks import lexicon as lx
-from appliance.llm.checks.facts import Claim, Facts, claims, free_said, text_said
+from appliance.llm.checks.facts import Claim, Facts, claims, free_said, number_said, robot_said, text_said
 from appliance.llm.checks.places import coordinate
 from appliance.llm.checks.reading import NUMBERS, Token
 from appliance.llm.checks.schema import is_unnamed
-from appliance.llm.values import FREE
+from appliance.llm.values import FREE, unit_of
 from appliance.model import Finding, Severity, Subtask
 
 _CLOCK = re.compile(
@@ -33,19 +35,7 @@ _REPEATED = re.compile(
     r"\b(?:twice|once|three times)\s+(?:a|an|per|each|every)\s+\w+",
     re.IGNORECASE,
 )
-_OFTEN = re.compile(
-    r"\bfrom time to time\b|\bnow and (?:then|again)\b|\b(?:once )?in a while\b|\bevery (?:so often|now and then)\b|"
-    r"\b(?:on and off|off and on)\b|\bat (?:regular )?intervals\b|\bround the clock\b|\btime and again\b|"
-    r"\bover and over\b|\bday (?:and|in,? day) (?:night|out)\b",
-    re.IGNORECASE,
-)
-"""Idioms of repeats: each of their words means nothing by itself."""
 _CLAUSE_END = frozenset((",", ";", ".", "!", "?", ":", "\n", "–", "—"))
-_SMALL = frozenset(
-    (",", ";", ".", "!", "?", ":", "\n", "=", "-", "–", "—", "(", ")", "&", "'", "/", "*", "•", "_", "…", '"', "+")
-)
-
-
 _LONGEST_S = 290.0
 """A wait that any skill may take."""
 _SPARE_S = 10.0
@@ -81,6 +71,18 @@ _NO_EVENT = (
 """A quantity alone is nothing that happens."""
 
 
+_COURTEOUS_EVENT = re.compile(
+    r"^(?:you|you've) (?:have|get|got|find) (?:a|the|some) (?:\w+ )?(?:moment|minute|sec|second|time)\b"
+)
+_SPOKEN_SO = re.compile(
+    r" (?:in|with) (?:\w+ ){0,3}(?:voice|tone|accent|language|whisper|volume|manner|style|dialect)\b"
+    r"| like (?:a|an|the|my) |"
+    r" in (?:english|german|french|spanish|italian|polish|portuguese|dutch|russian|chinese|japanese|hindi|arabic)\b"
+    r"| (?:aloud|loudly|quietly|softly|gently|slowly|politely|firmly|again|twice|thrice|repeatedly|\w+ times)$"
+)
+"""How something is spoken, which no skill can do."""
+
+
 class Scope(Finding, frozen=True, kw_only=True):
     """A negated clause, and which subtasks do what it forbids."""
 
@@ -99,24 +101,18 @@ def left(facts: Facts) -> list[int]:
 
 
 def _phrased(facts: Facts) -> set[int]:
-    """Tokens of runs of words that mean nothing by themselves."""
-    kept = facts.reading.memo.get(("filler", "", ""))
+    """Tokens of courtesies, whose words mean nothing by themselves."""
+    kept = facts.reading.memo.get(("courtesy", "", ""))
     if kept is not None:
         return set(kept)
     found: set[int] = set()
-    tokens = facts.reading.tokens
-    texts = ["ROBOT" if each.kind == "robot" else each.text for each in tokens]
-    for words in _filler_phrases():
+    texts = tuple(each.text for each in facts.reading.tokens)
+    for words in clauses.COURTESIES:
         for start in range(len(texts) - len(words) + 1):
-            if texts[start] == words[0] and tuple(texts[start : start + len(words)]) == words:
+            if texts[start] == words[0] and texts[start : start + len(words)] == words:
                 found.update(range(start, start + len(words)))
-    facts.reading.memo["filler", "", ""] = frozenset(found)
+    facts.reading.memo["courtesy", "", ""] = frozenset(found)
     return found
-
-
-@lru_cache(maxsize=1)
-def _filler_phrases() -> tuple[tuple[str, ...], ...]:
-    return tuple(sorted((tuple(each.split()) for each in lx.FILLER_PHRASES), key=len, reverse=True))
 
 
 def _clause_end(tokens: Sequence[Token], start: int, *, stops: frozenset[str] = frozenset(("but", "then"))) -> int:
@@ -163,6 +159,7 @@ def _scopes(facts: Facts) -> list[Scope]:
         asked = [
             each for group in options for each in group[:2]
             if set(each.at) <= inside and each.at[0] > number and tokens[each.at[0] - 1].text not in _BEFORE_NOUNS
+            and each.text not in _HASTE
         ]  # fmt: skip
         who = _who(facts, number, inside)
         broken = tuple(each.id for each in facts.plan.subtasks if _does(facts, each, asked, inside, who))
@@ -184,6 +181,8 @@ def _scopes(facts: Facts) -> list[Scope]:
     return found
 
 
+_HASTE = frozenset(("hurry", "rush", "dash", "zip"))
+"""How to go, rather than to go."""
 _HALTING = frozenset(("stopping", "pausing", "waiting", "halting"))
 _BEFORE_NOUNS = frozenset(("a", "an", "any", "the", "no", "some"))
 
@@ -246,7 +245,7 @@ def _may_do(facts: Facts, subtask: Subtask, asked: Sequence[Claim], inside: set[
     tokens = facts.reading.tokens
     own = [
         index for index in inside - verbs - facts.account.covered
-        if tokens[index].kind in ("word", "number") and tokens[index].text not in lx.FILLERS | lx.NEGATIONS
+        if tokens[index].kind in ("word", "number") and tokens[index].text not in clauses.SMALL | lx.NEGATIONS
     ]  # fmt: skip
     return not own or not facts.account.values[subtask.id]
 
@@ -281,7 +280,7 @@ def negation(facts: Facts) -> Iterable[Finding]:
             yield _hold("negation", f'the plan does not account for "{scope.words[0]}"', scope.words)
 
 
-_SORRY = lx.CORRECTIONS - {"no", "instead", "rather"}
+_SORRY = (lx.CORRECTIONS - {"no", "instead", "rather"}) | {"forget", "disregard"}
 
 
 # --- conditions -----------------------------------------------------------------------------------------------------
@@ -308,7 +307,7 @@ def _conditions(facts: Facts) -> tuple[set[int], list[tuple[int, tuple[int, ...]
             index for index in range(len(tokens)) if facts.reading.sentence[index] == sentence and index not in clause
         ]
         if (token.text in ("if", "provided", "providing") and _waits(facts, clause, governed)) or (
-            token.text == "if" and _only_reports(facts, set(governed), set(clause))
+            token.text == "if" and len(clause) > 3 and _only_reports(facts, set(governed), set(clause))
         ):
             kept |= set(clause)
         else:
@@ -350,12 +349,6 @@ def condition(facts: Facts) -> Iterable[Finding]:
         begins = number == 0 or facts.reading.sentence[number] != facts.reading.sentence[number - 1]
         if begins and token.text in ("should", "were", "had"):
             yield _hold("condition", f'"{token.text}" begins a condition', (token.text,))
-    rest = set(left(facts))
-    for number in sorted(rest):
-        after = tokens[number + 1].text if number + 1 < len(tokens) else ""
-        if tokens[number].text in _ONCE and number + 1 in rest and after in _SOMEBODY:
-            words = facts.words(range(number, _clause_end(tokens, number + 1)))
-            yield _hold("condition", f'the plan does not wait for "{words}"', (words,))
     for number, clause in _conditions(facts)[1]:
         words = facts.words(clause)
         first = facts.reading.tokens[number].text
@@ -364,10 +357,6 @@ def condition(facts: Facts) -> Iterable[Finding]:
             hint="wait for a person's answer instead, such as: wait for the all-clear from Ana, then ..."
             if first != "otherwise" else "",
         )  # fmt: skip
-
-
-_ONCE = frozenset(("when", "once", "after", "before", "until", "till", "while", "as"))
-_SOMEBODY = frozenset(("i", "we", "he", "she", "someone", "somebody"))
 
 
 def exception(facts: Facts) -> Iterable[Finding]:
@@ -385,25 +374,25 @@ def exception(facts: Facts) -> Iterable[Finding]:
 
 
 def time(facts: Facts) -> Iterable[Finding]:
-    """Clock times, delays and repeats are not supported: a plan that passes one over cannot run."""
+    """Clock times, delays and repeats are no part of a plan, and one that passes them over cannot run.
+
+    The hint names the command that schedules the instruction.
+    """
     rest = set(left(facts))
     tokens = facts.reading.tokens
     found: list[int] = []
-    small = lx.FILLERS - {"every", "each"}
+    small = clauses.SMALL - lx.TIMES - lx.UNITS - {"every", "each"}
     text = facts.reading.text
     for match in (*_CLOCK.finditer(text), *_DELAYED.finditer(text), *_REPEATED.finditer(text)):
         inside = [n for n, each in enumerate(tokens) if each.start < match.end() and each.end > match.start()]
         if inside and any(index in rest and tokens[index].text not in small for index in inside):
             found += inside
-    free = _free_values(facts)
-    for match in _OFTEN.finditer(text):
-        found += [n for n, each in enumerate(tokens) if match.start() <= each.start < match.end() and n not in free]
     if found:
         words = facts.words(sorted(set(found)))
         yield Finding(
             check="time", severity=Severity.REFUSE, words=(words,),
-            message=f'clock times, delays and repeats are not supported yet: "{words}"',
-            hint="submit the order when it is due; a robot can wait up to 290 s, such as: wait 30 seconds, then ...",
+            message=f'clock times, delays and repeats are not supported in an instruction: "{words}"',
+            hint=f"{_scheduled(facts.instruction)}; a robot can wait up to 290 s, such as: wait 30 seconds, then ...",
         )  # fmt: skip
         return
     for subtask in facts.plan.subtasks:
@@ -420,9 +409,16 @@ def time(facts: Facts) -> Iterable[Finding]:
             if tokens[index].text == "again" and any(index - 1 in each for each in facts.account.called.values()):
                 continue  # "switch it off again"
             word = tokens[index].text
-            hint = "clock times, delays and repeats are not supported yet: submit the order when it is due"
+            hint = f"times are not supported in an instruction: {schedules.GENERIC}"
             yield _hold("time", f'the plan does not account for "{word}"', (word,), hint=hint)
             return
+
+
+def _scheduled(instruction: str) -> str:
+    """Return the command that schedules an instruction, by the expressions of time in it."""
+    spans = sorted(match.span() for each in (_CLOCK, _DELAYED, _REPEATED) for match in each.finditer(instruction))
+    apart = all(end <= begin for (_, end), (begin, _) in pairwise(spans))
+    return schedules.command(instruction, spans) if spans and apart else schedules.GENERIC
 
 
 def alternative(facts: Facts) -> Iterable[Finding]:
@@ -436,23 +432,9 @@ def alternative(facts: Facts) -> Iterable[Finding]:
             return
 
 
-_BACK = re.compile(
-    r"\bno,? wait\b|\bwait,? no\b|\bmake that\b|\bhang on\b|\bhold on\b|\bon second thoughts?\b|\bcome to think\b|"
-    r"\bchange of plans?\b|\bstrike that\b|\bforget (?:that|it|what)\b|\bthat is to say\b|\bnever ?mind\b",
-    re.IGNORECASE,
-)
-"""Idioms that take back what was said before."""
-
-
 def correction(facts: Facts) -> Iterable[Finding]:
     """A correction in mid-sentence is looked at by a person."""
     tokens = facts.reading.tokens
-    if back := _BACK.search(facts.reading.text):
-        inside = {n for n, each in enumerate(tokens) if back.start() <= each.start < back.end()}
-        if not inside & _free_values(facts):
-            yield _hold("correction", f'"{back.group()}" takes something back', (back.group(),),
-                        hint="say the order once, as it is meant")  # fmt: skip
-            return
     phrased = _phrased(facts)
     for number in left(facts):
         if tokens[number].kind == "word" and tokens[number].text in lx.CORRECTIONS and number not in phrased:
@@ -468,45 +450,6 @@ def _opens_line(tokens: Sequence[Token], number: int) -> bool:
     return number == 0 or tokens[number - 1].text == "\n"
 
 
-_VAGUE = re.compile(
-    r"\bsome (?:other )?(?:time|day)\b|\bsomeday\b|\bone (?:of these )?days?\b|\bin due (?:course|time)\b|"
-    r"\bon (?:my|our|his|her|their|the) (?:mark|signal|command|cue)\b|\b(?:is|are|was|has been|put) on hold\b|"
-    r"\bcalled off\b|\bcan wait\b|\blike (?:last time|before|always|usual|yesterday|the last one)\b|"
-    r"\bas (?:usual|always|last time)\b|\bthe usual\b|\bthe way (?:we|you|i|they)\b|\bsame as\b|"
-    r"\band so (?:on|forth)\b|"
-    r"\betc\b|\band then some\b|\bor something\b|\btake care of\b|\bfinish the job\b|\bsaid (?:no one|nobody)\b|"
-    r"\b(?:just )?kidding\b|\bnvm\b|\bi (?:guess|suppose|wish)\b|\bbut (?:stay|remain|stand)\b|\bin reverse\b|"
-    r"\b(?:pending|subject to)\b|\bpermitting\b|\bso long as\b|\bin case of\b|"
-    r"\bto be (?:confirmed|decided)\b|\btb[acd]\b",
-    re.IGNORECASE,
-)
-"""Idioms that leave open when, how or whether an order is meant, or take it back; their single words say nothing."""
-_NO_ORDER = re.compile(
-    r"\W*(?:(?:hey|hi|hello|ok|okay|so|and|then|well)\W+)*(?:"
-    r"may (?:i|we)(?! have\b| trouble\b| ask\b)|should (?:i|we)|you (?:should|could|might|must) have|you were|"
-    r"i (?:never|didn't|did not|don't|do not)|"
-    r"(?:when|why|where|who|how) (?:will|would|do|does|did|is|are|was|were|can|could|should|shall|have|has)|"
-    r"(?:have|has|had|did|does|do) (?:you|we|they|he|she|i)(?! mind\b| think\b| fancy\b))\b",
-    re.IGNORECASE,
-)
-"""Beginnings that ask, or tell of what was or might have been."""
-
-
-def vague(facts: Facts) -> Iterable[Finding]:
-    """An order that leaves open when, how or whether it is meant is looked at by a person."""
-    tokens, text = facts.reading.tokens, facts.reading.text
-    spoken = _free_values(facts)
-    quoted = {number for number, token in enumerate(tokens) if token.kind == "quote"}
-    for match in _VAGUE.finditer(text):
-        inside = {n for n, each in enumerate(tokens) if each.start < match.end() and each.end > match.start()}
-        if inside and not inside <= spoken | quoted:
-            yield _hold("alternative", f'"{match.group()}" leaves open what is meant', (match.group(),))
-            return
-    if match := _NO_ORDER.match(text):
-        yield _hold("question", f'"{match.group().strip()}" begins no order', (match.group().strip(),),
-                    hint="say what the robots are to do: rover_1: go to dock 1")  # fmt: skip
-
-
 def told_values(facts: Facts) -> Iterable[Finding]:
     """What is reported, and to whom, is said as such: trailing words are no subject of a report."""
     tokens = facts.reading.tokens
@@ -518,7 +461,8 @@ def told_values(facts: Facts) -> Iterable[Finding]:
                 continue
             if value in ("operator", "home") or (facts.site is not None and facts.site.find(value) is not None):
                 continue
-            said = text_said(facts.reading, value, facts.site)
+            said = robot_said(facts.reading, value, subtask.skill, facts.catalogue)
+            said = said or text_said(facts.reading, value, facts.site)
             if not said:
                 continue
             lead = min(said) - 1
@@ -667,8 +611,14 @@ def question(facts: Facts) -> Iterable[Finding]:
                     hint="ask for the state of robots with: swiftbot robots")  # fmt: skip
 
 
+_GREETINGS = frozenset(
+    ("hey", "hi", "hello", "good", "dear", "morning", "afternoon", "evening", "day", "ok", "okay", "so", "and", "then")
+) | {"please"}
+"""Words before a courteous question that ask nothing."""
+
+
 def _courteous(words: Sequence[str]) -> bool:
-    body = [each for each in words if each not in ("hey", "hi", "hello", "ok", "okay", "so", "and", "then", "please")]
+    body = [each for each in words if each not in _GREETINGS]
     if body[:1] == ["mind"] or (body[:1] == ["would"] and "mind" in body[1:3]) or words[-1:] == ["please"]:
         return True
     return len(body) > 1 and body[0] in ("could", "can", "would", "will") and body[1] in (
@@ -733,11 +683,53 @@ def pronoun(facts: Facts) -> Iterable[Finding]:
         if not before and token.text not in ("here", "her", "his"):
             yield _hold("pronoun", f'nothing was said that "{token.text}" could mean', (token.text,))
             return
+    yield from _one_of_several(facts)
     for subtask in facts.plan.subtasks:
         for name, value in subtask.params.items():
             spoken = name in ("text", "question", "event", "about", "to")
             if isinstance(value, str) and not spoken and set(value.split()) & lx.NAMELESS:
                 yield _hold("pronoun", f'{subtask.id}: {name} is "{value}", which names nothing', (value,))
+
+
+def _one_of_several(facts: Facts) -> Iterable[Finding]:
+    """A word for one robot or thing follows where one was said: "rover_1 and rover_2 go there, then it lands"."""
+    tokens = facts.reading.tokens
+    for number, token in enumerate(tokens):
+        if token.text not in _SINGULAR or not number or number in _free_values(facts) or number in _phrased(facts):
+            continue
+        after = number + 1 if number + 1 < len(tokens) else number
+        acts = tokens[after].text in _ACTS or any(after in called for called in facts.account.called.values())
+        robots = any(each.kind == "robot" for each in tokens[:number])
+        if acts and after != number and robots and len(facts.governors[number]) > 1:
+            yield _hold(
+                "pronoun", f'"{token.text}" may be any of {", ".join(sorted(facts.governors[number]))}', (token.text,)
+            )
+            return
+        for subtask in facts.plan.subtasks:
+            if number - 1 in facts.account.called[subtask.id] and len(held := _held(facts, subtask)) > 1:
+                yield _hold("pronoun", f'"{token.text}" may be any of {", ".join(sorted(held))}', (token.text,))
+                return
+
+
+def _held(facts: Facts, subtask: Subtask) -> set[str]:
+    """The things that a robot has when it puts one down: those it took before and has not put down."""
+    manifest = facts.manifest(subtask)
+    if manifest is None or "load" not in manifest.frees:
+        return set()
+    earlier = [
+        (each, m)
+        for each in facts.plan.subtasks
+        if each.id in facts.before[subtask.id]
+        and each.robot == subtask.robot
+        and "object" in each.params
+        and (m := facts.manifest(each)) is not None
+    ]
+    taken = {str(each.params["object"]) for each, m in earlier if "load" in m.ties}
+    return taken - {str(each.params["object"]) for each, m in earlier if "load" in m.frees}
+
+
+_SINGULAR = frozenset(("it", "he", "she", "him", "her"))
+_ACTS = frozenset(("should", "must", "shall", "will", "can", "needs", "then"))
 
 
 def _subject(facts: Facts, number: int) -> bool:
@@ -760,12 +752,27 @@ def _uses(facts: Facts, subtask: Subtask) -> tuple[str, ...]:
 
 
 def leaving(facts: Facts) -> Iterable[Finding]:
-    """A place that a robot is to leave is not where it is sent."""
+    """A place that a robot is to leave, or that it is to look at from elsewhere, is not where it is sent."""
     tokens = facts.reading.tokens
+    texts = [token.text for token in tokens]
+    from_elsewhere = any(pair in (("from", "there"), ("from", "here")) for pair in pairwise(texts))
     for subtask in facts.plan.subtasks:
         manifest = facts.manifest(subtask)
         if manifest is None or not manifest.moves_robot:
             continue
+        said = facts.account.values[subtask.id]
+        if (
+            from_elsewhere
+            and subtask.skill in lx.WAYS
+            and any(
+                said and said <= facts.account.called[other.id] | facts.account.values[other.id]
+                for other in facts.plan.subtasks
+                if other.robot == subtask.robot and other.skill not in lx.WAYS
+            )
+        ):
+            yield _hold(
+                "polarity", f'{subtask.id}: the words say "from there", and the plan goes there', ("from there",)
+            )
         for index in facts.account.values[subtask.id]:
             before = index - 1
             while before > 0 and tokens[before].text in ("the", "a", "our"):
@@ -827,6 +834,11 @@ def _free_text(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterabl
         yield f'"{place.group().strip()}" may be where it is to be spoken'
     if subtask.params.get("to") == "operator" and "speaker" in _uses(facts, subtask):
         yield "a robot cannot speak to the operator: notify does"
+    ahead = re.match(r"(?:at|in|by|near|to|from) (?:the )?([\w ]+?)[:,]", value.lower())
+    if name == "text" and not quoted and ahead and facts.site is not None and facts.site.find(ahead.group(1)):
+        yield f'"{ahead.group().strip()}" may be where it is to be spoken'
+    if name == "text" and not quoted and (how := _SPOKEN_SO.search(value.lower())):
+        yield f'"{how.group().strip()}" may be how it is to be spoken'
     words = set(re.findall(r"[a-z]+", value.lower()))
     inner = sorted(free_said(facts.reading, value) or ())[1:]
     swallowed = any(facts.reading.tokens[index].kind == "robot" for index in inner)
@@ -834,6 +846,8 @@ def _free_text(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterabl
         yield f'"{value}" is more than something that happens'
     if name == "event" and re.match(r"(?:there|here|at|in|on)\b", value.lower()):
         yield f'"{value}" is where something is, and nothing that happens'
+    if name == "event" and _COURTEOUS_EVENT.search(value.lower()):
+        yield f'"{value}" is courtesy, and nothing that happens'
     if name == "event" and (words <= _NO_EVENT or set(value.lower().split()[-1:]) & lx.DURATIONS):
         yield f'"{value}" is nothing that happens'
 
@@ -844,7 +858,7 @@ def _name(facts: Facts, subtask: Subtask, name: str, value: str) -> Iterable[str
     low = value.lower()
     if low in _NOBODY:
         yield f'{name} "{value}" names nobody and nothing'
-    if name in ("to", "person") and set(low.split()) & {"over", "through", "via", "by", "using", "on"}:
+    if name in ("to", "person") and set(low.split()) & {"over", "through", "via", "by", "using", "on", "in", "with"}:
         yield f'{name} "{value}" is more than a name'
     if (facts.site is not None and facts.site.find(value) is not None) or coordinate(value) is not None:
         return
@@ -906,6 +920,26 @@ def quantity(facts: Facts) -> Iterable[Finding]:
                 yield _hold(
                     "quantity", f'{subtask.id}: {name} "{value}" holds "{said}", which is no part of a name', (said,)
                 )
+    yield from _durations(facts)
+
+
+def _durations(facts: Facts) -> Iterable[Finding]:
+    """What is said behind "for" with a unit of time is how long, and the value of nothing else."""
+    tokens = facts.reading.tokens
+    for subtask in facts.plan.subtasks:
+        for name, value in subtask.params.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or name in _HOW_LONG:
+                continue
+            for number in number_said(facts.reading, value, unit_of(name)) or ():
+                unit = tokens[number + 1].text if number + 1 < len(tokens) else ""
+                if number and tokens[number - 1].text == "for" and unit in lx.DURATIONS:
+                    words = f"for {tokens[number].text} {unit}"
+                    yield _hold(
+                        "quantity", f'{subtask.id}: the words say "{words}", and {name} is no duration', (words,)
+                    )
+
+
+_HOW_LONG = frozenset(("duration_s", "timeout_s"))
 
 
 def delivery(facts: Facts) -> Iterable[Finding]:
@@ -936,43 +970,11 @@ def _item(tokens: Sequence[Token], number: int) -> bool:
 
 
 def coverage(facts: Facts) -> Iterable[Finding]:
-    """Every word stands in the plan, or says nothing by itself."""
+    """Every word stands in the plan, or is derivable as part of an order."""
     tokens = facts.reading.tokens
-    special = lx.NEGATIONS | lx.CONDITIONS | lx.EXCEPTIONS | lx.TIMES | lx.ALTERNATIVES | lx.CORRECTIONS
-    scoped = {index for each in _scopes(facts) for index in each.at} | {
-        index for _, clause in _conditions(facts)[1] for index in clause
-    }
-    claimed = {index for each in facts.account.unclaimed for index in each.at}
-    unknown: list[int] = []
-    for number in left(facts):
-        token = tokens[number]
-        if number in scoped or number in claimed:
-            continue
-        if token.kind == "mark" and (token.text in _SMALL or token.text == "?"):
-            continue
-        if token.kind == "number":
-            continue
-        if token.text in ("could", "would") and number + 1 < len(tokens) and tokens[number + 1].kind == "robot":
-            continue  # `question` looks at these
-        if token.kind == "word" and (token.text in special or token.text in lx.FILLERS):
-            continue
-        if token.kind == "word" and token.text in lx.RESULTS and _later(facts, number) and not _alone(tokens, number):
-            continue
-        if token.kind == "word" and token.text in lx.UNITS and number and tokens[number - 1].value is not None:
-            continue
-        if (
-            token.kind == "word"
-            and token.text in ("up", "down", "back", "away", "again")
-            and _after_motion(facts, number)
-        ):
-            continue
-        if token.text in ("up", "back", "home") and any(
-            (m := facts.manifest(each)) is not None and m.moves_robot for each in facts.plan.subtasks
-        ):
-            continue
-        unknown.append(number)
+    unknown = _stray(facts) or _said_twice(facts)
     if unknown:
-        words = tuple(dict.fromkeys(tokens[index].text for index in unknown))[:12]
+        words = tuple(dict.fromkeys(tokens[index].text for index in unknown if tokens[index].text.strip()))[:12]
         shown = ", ".join(f'"{each}"' for each in words)
         yield _hold(
             "coverage",
@@ -980,6 +982,86 @@ def coverage(facts: Facts) -> Iterable[Finding]:
             words,
             hint="leave these words out, or say it otherwise",
         )
+
+
+def _stray(facts: Facts) -> list[int]:
+    """Tokens that neither the plan accounts for nor the recogniser of clauses derives."""
+    cached = facts.__dict__.get("_stray")
+    if cached is None:
+        texts = [each.text for each in facts.reading.tokens]
+        cached = clauses.outstanding(_labels(facts), texts, several=len(facts.plan.subtasks) > 1)
+        facts.__dict__["_stray"] = cached
+    return cached
+
+
+def _said_twice(facts: Facts) -> list[int]:
+    """A verb beside the one that its subtask has: "go to dock 1 and continue", "say: rover_1, say hello"."""
+    tokens, account = facts.reading.tokens, facts.account
+    called = set[int]().union(*account.called.values()) if account.called else set[int]()
+    content = called.union(*account.values.values()) if account.values else called
+    begin, end = min(content, default=-1), max(content, default=-1)
+    led = begin in called and tokens[begin].text not in ("tell", "ask")
+    if led and begin + 1 < len(tokens) and tokens[begin + 1].robots:
+        asked = [each for each in facts.plan.subtasks if begin in account.called[each.id]]
+        still = not any((m := facts.manifest(each)) is not None and m.moves_robot for each in asked)
+        if asked and still and all(max(account.called[each.id]) > begin + 1 for each in asked):
+            return [begin]
+    if end not in called or tokens[end].text in ("thanks", "thank"):
+        return []
+    begin = end
+    while begin - 1 in called:
+        begin -= 1
+    before = tokens[begin - 1].text if begin else ""
+    joined = before in ("and", "then")
+    last = end + 1 == len(tokens) or tokens[end + 1].kind == "mark"
+    if not last or tokens[begin].text in _PARTICLES or not (joined or begin - 1 in content):
+        return []
+    asked = [each for each in facts.plan.subtasks if account.called[each.id] & set(range(begin, end + 1))]
+    double = all(
+        max(account.values[each.id], default=begin) < begin and (joined or min(account.called[each.id]) < begin)
+        for each in asked
+    )
+    return list(range(begin, end + 1)) if asked and double else []
+
+
+_PARTICLES = frozenset(("up", "down", "on", "off", "out", "back", "over", "in", "many", "know", "again"))
+
+
+def _labels(facts: Facts) -> list[str]:
+    """What each token is for the recogniser of clauses: content that the plan accounts for, or a word."""
+    account, tokens = facts.account, facts.reading.tokens
+    kept = forbidden(facts) | _conditions(facts)[0]
+    called = set[int]().union(*account.called.values()) if account.called else set[int]()
+    values = set[int]().union(*account.values.values()) if account.values else set[int]()
+    found: list[str] = []
+    item = 0.0
+    for number, token in enumerate(tokens):
+        if number in kept:
+            found.append("K")
+        elif token.kind == "robot" and token.robots:
+            found.append("R")
+        elif (token.text in ("thank", "thanks") and number not in values) or (
+            token.text == "you" and number and found[-1] == "thank"
+        ):
+            found.append(token.text)
+        elif number in called:
+            found.append("V")
+        elif number in values or (number in account.covered and (token.kind != "robot" or facts.robots is None)):
+            found.append("A")
+        elif token.kind == "number" and _item(tokens, number) and token.value == item + 1:
+            item += 1
+            found.append("\n")
+        elif token.text in ("-", "*", "•") and _opens_line(tokens, number) and number + 1 < len(tokens):
+            found.append("\n")
+        elif token.kind == "quote":
+            found.append('"')
+        elif (token.text in lx.RESULTS and _later(facts, number) and not _alone(tokens, number)) or (
+            token.text in lx.UNITS and number and tokens[number - 1].value is not None
+        ):
+            found.append("A")
+        else:
+            found.append(token.text)
+    return found
 
 
 def _alone(tokens: Sequence[Token], number: int) -> bool:
@@ -993,13 +1075,6 @@ def _later(facts: Facts, number: int) -> bool:
     return any(evidence and min(evidence) < number for evidence in facts.account.evidence.values())
 
 
-def _after_motion(facts: Facts, number: int) -> bool:
-    before = number - 1
-    while before > 0 and facts.reading.tokens[before].text in ("it", "them"):
-        before -= 1
-    return any(before in found for found in (*facts.account.called.values(), *facts.account.values.values()))
-
-
 def polarity(facts: Facts) -> Iterable[Finding]:
     """Each verb is carried out by a skill that it asks for, and each subtask is asked for by words."""
     if facts.continued:
@@ -1008,11 +1083,12 @@ def polarity(facts: Facts) -> Iterable[Finding]:
         other for each in facts.plan.subtasks if (m := facts.manifest(each)) is not None for other in m.opposite_of
     }
     kept = forbidden(facts) | _conditions(facts)[0] | _phrased(facts)
+    stray = set(_stray(facts))
     for claim in facts.account.unclaimed:
         if set(claim.at) <= kept or set(claim.at) & _free_values(facts):
             continue
-        if all(facts.reading.tokens[index].text in lx.FILLERS | {"up"} for index in claim.at):
-            continue
+        if not set(claim.at) & stray:
+            continue  # "once it is there", "have rover_1 ...": part of what makes an order
         if facts.reading.tokens[claim.at[0]].text in lx.RESULTS and _later(facts, claim.at[0]):
             continue
         asks = ", ".join(sorted(claim.skills))
@@ -1090,7 +1166,7 @@ def sequence(facts: Facts) -> Iterable[Finding]:
     tokens = facts.reading.tokens
     subtasks = facts.plan.subtasks
     called = facts.account.called
-    evidence = {each.id: facts.account.values[each.id] or called[each.id] for each in subtasks}
+    evidence = {each.id: _own(facts, each) for each in subtasks}
     for number, token in enumerate(tokens):
         if token.text == "first" and _closes(tokens, number):
             begin = next(
@@ -1109,7 +1185,7 @@ def sequence(facts: Facts) -> Iterable[Finding]:
                 return
         if token.kind != "word":
             continue
-        if token.text in lx.SEQUENCE:
+        if token.text in lx.SEQUENCE or _done_first(facts, number):
             first = [each for each in subtasks if evidence[each.id] and min(evidence[each.id]) < number]
             second = [each for each in subtasks if evidence[each.id] and min(evidence[each.id]) > number]
             forward = any(a.id in facts.before[b.id] for a in first for b in second)
@@ -1119,7 +1195,7 @@ def sequence(facts: Facts) -> Iterable[Finding]:
             if first and second and (back or not forward):
                 yield _hold("sequence", f'"{token.text}" is said, and the plan has another order', (token.text,))
                 return
-        elif token.text in lx.SIDE_BY_SIDE or _phrase_here(tokens, number):
+        elif token.text in lx.SIDE_BY_SIDE or side_by_side(tokens, number) or _in_the_meantime(tokens, number):
             pairs = ((a, b) for n, a in enumerate(subtasks) for b in subtasks[n + 1 :])
             if all(a.id in facts.before[b.id] or b.id in facts.before[a.id] for a, b in pairs):
                 yield _hold("sequence", f'"{token.text}" is said and nothing runs side by side', (token.text,))
@@ -1127,6 +1203,42 @@ def sequence(facts: Facts) -> Iterable[Finding]:
     yield from _opposites(facts)
     yield from _before_after(facts)
     yield from _as_said(facts)
+
+
+def _done_first(facts: Facts, number: int) -> bool:
+    """Whether what was said before is done first by a word: "after that", "when they are there, ...".
+
+    A clause of its own content says what else is first ("once you have photographed it"), or is waited for.
+    """
+    tokens, account = facts.reading.tokens, facts.account
+    after = tokens[number + 1].text if number + 1 < len(tokens) else ""
+    if tokens[number].text == "after" and after in ("that", "this"):
+        return True
+    soon = tokens[number].text == "as" and tokens[number - 1].text == "soon"
+    if not (soon or tokens[number].text in ("after", "when", "once")) or after not in _THEY:
+        return False
+    if any(number in account.called[each.id] or number + 1 in account.values[each.id] for each in facts.plan.subtasks):
+        return False
+    inside = number + 1
+    while inside < len(tokens) and (tokens[inside].text in _THEY | _HAVE or tokens[inside].value is not None):
+        inside += 1
+    return not any(evidence and min(evidence) == inside for evidence in account.evidence.values())
+
+
+_THEY = frozenset(
+    "it it's they they're they've you you're you've he he's she she's all both everyone everybody".split()  # noqa: SIM905 - a list of words
+)
+_HAVE = frozenset(("has", "have", "is", "are", "been", "both", "all", "of", "them"))
+
+
+def _in_the_meantime(tokens: Sequence[Token], number: int) -> bool:
+    return [each.text for each in tokens[number : number + 3]] == ["in", "the", "meantime"]
+
+
+def _own(facts: Facts, subtask: Subtask) -> set[int]:
+    """The tokens that say what a subtask does; of several mentions those that the words give to its robot."""
+    said = facts.account.values[subtask.id] or facts.account.called[subtask.id]
+    return {index for index in said if subtask.robot in facts.governors[index]} or said
 
 
 def _as_said(facts: Facts) -> Iterable[Finding]:
@@ -1175,7 +1287,7 @@ def _opposites(facts: Facts) -> Iterable[Finding]:
                 return
 
 
-def _phrase_here(tokens: Sequence[Token], number: int) -> bool:
+def side_by_side(tokens: Sequence[Token], number: int) -> bool:
     """Whether "at the same time" or "in parallel" ends here."""
     texts = [each.text for each in tokens[max(0, number - 3) : number + 1]]
     return texts[-4:] == ["at", "the", "same", "time"] or texts[-2:] == ["in", "parallel"]

@@ -24,8 +24,8 @@ from typing import Any, Protocol
 
 from msgspec import Struct, field
 
-from appliance.llm.checks.facts import forms
 from appliance.llm.rules import lexicon as lx
+from appliance.llm.words import forms
 from appliance.skills.catalogue import SKILLS, Catalogue, SkillManifest
 
 

@@ -9,8 +9,8 @@ spoken to); the verb may stand in any form, the passive included. It is read wit
 reading can be tried and dropped. Quantities said beside the verb (how long, how fast, how often) are taken out before
 it is matched: "film it for two minutes" and "for two minutes, film it" need one pattern of the grammar and not four.
 
-Orders that wait for others, or are told in another sequence than they happen ("while A, B", "before A, B", "once A, B",
-"A after B", "A first", "if A, B"), come down to clauses added in the order in which they happen, and edges between
+Orders that wait for others, or are named in another sequence than they happen ("while A, B", "before A, B", "once A,
+B", "A after B", "A first", "if A, B"), come down to clauses added in the order in which they happen, and edges between
 them.
 """
 
@@ -195,7 +195,7 @@ _TOOLED = frozenset({"localize", "match_scene", "split_area", "fasten"})
 
 
 class Who(Struct):
-    """The subject: robots, or `[]` for whoever was spoken to last. `kind` says how it was put."""
+    """The subject: robots, or `[]` for the one spoken to last. `kind` says how it was put."""
 
     robots: list[str] = field(default_factory=list[str])
     kind: str = "elided"
@@ -623,7 +623,7 @@ class Conditions(ABC):
     def _afterwards(self, kind: str, said: str, clause: Clause, before: str, start: Snapshot | None) -> set[int] | None:
         """Read "A after B" in the order in which it happens; None when B is no clause.
 
-        B is told with A's words ("places the box after fetching it"), so A is remembered first, then B is added.
+        B is said with A's words ("places the box after fetching it"), so A is remembered first, then B is added.
         """
         speaking_to, last = self._to, self._last
         self._to = self._doers(clause.who)
@@ -1019,9 +1019,9 @@ class Parser(Conditions):
                     told = True
                     continue
             self._lost += clause.lost
-            anew = not pending or clause.who.kind not in ("elided", "pronoun")
+            fresh = not pending or clause.who.kind not in ("elided", "pronoun")
             how = "beside" if self._all_beside and pending and kind == "list" else kind
-            firsts, ends = self._emit(how, clause, start if anew else None)
+            firsts, ends = self._emit(how, clause, start if fresh else None)
             if kind == "after" and pending:
                 self._graph.order(ends, pending[-1])
             pending.append(firsts)

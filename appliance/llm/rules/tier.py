@@ -8,7 +8,7 @@ understood says little alone: of the held-out instructions that were understood 
 since a pattern fits sooner than it means the same. Long sentences are read wrong more often than short ones, and such
 that give few orders for their words more often than plain lists of orders.
 
-When the rest of a plan is to be planned anew, a failed subtask is replaced by a skill that manifests name as an
+When the rest of a plan is to be replanned, a failed subtask is replaced by a skill that manifests name as an
 alternative, or as an alternative of that, on a robot that can do it. Rules understand words, not causes: where that
 does not help they say so.
 """

@@ -1,6 +1,9 @@
 """Eviction: what an idle container is worth, which goes first when room is short, and how long one is kept otherwise.
 
-The facts the policies are told and the orders they answer, each with its reason, are here too (`Idle`, `View`; `Start`,
+A further policy is a class with the three methods of `Evictor`, a line in `EVICTION`, and its name in
+`pool.settings.PoolConfig.eviction`.
+
+The facts that policies see and the orders they answer, each with its reason, are here too (`Idle`, `View`; `Start`,
 `Retire`), and what a cold start of an image costs on this gateway (`ColdCosts`).
 
 LeastRecent: what has not been used for longest goes first.
@@ -35,6 +38,7 @@ from msgspec import Struct, field
 from numpy.typing import NDArray
 
 from appliance.pool.policies.forecast import LONGEST_S, Demand, Histogram, Level, until_level_s
+from appliance.pool.settings import PoolConfig
 
 
 class Idle(Struct, frozen=True, kw_only=True):
@@ -412,6 +416,15 @@ class Learned:
         self._duels = kept
 
 
+EVICTION: dict[str, Callable[[Learned], Evictor]] = {
+    "learned": lambda learned: learned,
+    "greedy-dual": lambda _: GreedyDual(),
+    "lru": lambda _: LeastRecent(),
+}
+"""The eviction policies by their names in `pool.eviction`, each made for one planner. What
+demand teaches the learned one is known whichever decides: `pool.keep` may ask it."""
+
+
 class Keeping(Protocol):
     """Says when an idle container has been kept for long enough."""
 
@@ -478,3 +491,16 @@ class KeepWorth:
         if idle.cold_ms * self._usual_mb_s >= self._costs.usual_ms() * idle.memory_mb * wait_s:
             return ""
         return f"not expected to be used for {wait_s:.0f} s"
+
+
+def _keep_worth(config: PoolConfig, learned: Learned, histogram: Histogram, costs: ColdCosts) -> Keeping:
+    sharp = histogram if "histogram" in config.prewarm else None
+    return KeepWorth(learned, sharp, costs, usual_mb=config.container_memory_mb, idle_s=config.idle_s)
+
+
+KEEPING: dict[str, Callable[[PoolConfig, Learned, Histogram, ColdCosts], Keeping]] = {
+    "fixed": lambda config, _learned, _histogram, _costs: KeepFixed(config.idle_s),
+    "histogram": lambda config, _learned, histogram, _costs: KeepHistogram(histogram, KeepFixed(config.idle_s)),
+    "worth": _keep_worth,
+}
+"""How long idle containers are kept, by the names in `pool.keep`."""

@@ -20,17 +20,13 @@ from msgspec.structs import replace
 
 from appliance.model import PoolHint
 from appliance.pool.policies.eviction import (
+    EVICTION,
+    KEEPING,
     ColdCosts,
     Evictor,
-    GreedyDual,
     Idle,
-    KeepFixed,
-    KeepHistogram,
-    Keeping,
-    KeepWorth,
     Learned,
     LearnedState,
-    LeastRecent,
     Retire,
     Start,
     View,
@@ -146,23 +142,9 @@ class Planner:
         chosen = [each for name, each in known.items() if name in settings.prewarm]
         self._forecasters: list[Forecaster] = [self._wishes, *chosen]
         self._learned = Learned(self._demand, next_hint_s=self._hints.next_s, hour=hour)
-        fixed = KeepFixed(settings.idle_s)
-        sharp = histogram if "histogram" in settings.prewarm else None
-        kinds: dict[str, Keeping] = {
-            "fixed": fixed,
-            "histogram": KeepHistogram(histogram, fixed),
-            "worth": KeepWorth(
-                self._learned, sharp, costs, usual_mb=settings.container_memory_mb, idle_s=settings.idle_s
-            ),
-        }
-        self._keeping = kinds[settings.keep]
+        self._keeping = KEEPING[settings.keep](settings, self._learned, histogram, costs)
         self._learns = settings.keep == "worth" or settings.eviction == "learned"
-        policies: dict[str, Evictor] = {
-            "greedy-dual": GreedyDual(),
-            "lru": LeastRecent(),
-            "learned": self._learned,
-        }
-        self._evictor = evictor or policies[settings.eviction]
+        self._evictor = evictor or EVICTION[settings.eviction](self._learned)
         self.weighed: Weighed | None = None
         """What the last room for a run was made from, where it took the place of something."""
 

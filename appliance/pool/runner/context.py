@@ -17,7 +17,7 @@ from .spec import Skill, Spec
 MAX_ARTIFACT = 11 * 2**20
 """Longest file in bytes that is kept as an artifact: as base64 it fits into one frame."""
 MAX_NEWS = 2**20
-"""Longest partial result in bytes of JSON: it is news for whoever listens."""
+"""Longest partial result in bytes of JSON: it is news for listeners."""
 MAX_CHECKPOINT = 2**18
 """Longest checkpoint in bytes of JSON: it is kept on several gateways and travels with the next attempt's order."""
 
@@ -36,6 +36,7 @@ class Surroundings:
         self.site: dict[str, Any] = spec.site
         self.folder = skill.folder
         self._volumes = spec.volumes
+        self._folders = spec.folders
 
     def volume(self, name: str) -> Path:
         """Return the folder of a named volume.
@@ -46,6 +47,20 @@ class Surroundings:
         path = self._volumes / name
         if path.parent != self._volumes or not path.is_dir():
             raise Fail(f"there is no volume {name!r} here", "name it in `volumes` of the skill's manifest")
+        return path
+
+    def host_folder(self, name: str) -> Path:
+        """Return a folder of the gateway's machine, which can be read only.
+
+        Raises:
+            Fail: it is not mounted here.
+        """
+        path = self._folders / name
+        if path.parent != self._folders or not path.is_dir():
+            raise Fail(
+                f"the folder {name!r} is not mounted here",
+                f"name it in `folders` of the skill's manifest, and see that pool.folders.{name} is there",
+            )
         return path
 
     def map(self, path: str | Path) -> mmap.mmap:
@@ -72,6 +87,8 @@ class Context(Surroundings):
         resume: The last checkpoint of the attempts before, or None.
         preloaded: What the handler's `preload` returned, or None.
         scratch: A folder of this run alone, gone afterwards.
+        cache: A folder that all containers of the image on this gateway share, for what can be worked out again; it may
+            be emptied at any time. `scratch` where the manifest asks for none.
     """
 
     CallError = CallError
@@ -89,6 +106,7 @@ class Context(Surroundings):
             link.go_on_from(int(order.get("calls") or 0))
         self.preloaded = preloaded
         self.scratch = scratch
+        self.cache = spec.cache or scratch
 
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:
         """Have the robot do `verb` and return its answer; files come as bytes in `answer["blobs"][name]`.
@@ -151,7 +169,7 @@ class Context(Surroundings):
     def checkpoint_due(self) -> bool:
         """Whether the appliance wants a checkpoint now, because it is about to move the run to another gateway.
 
-        A handler whose checkpoints cost something asks this between two steps, and saves when it is told to. It has
+        A handler whose checkpoints cost something asks this between two steps, and saves when the answer is yes. It has
         a second or two; a run that saves nothing by then goes on elsewhere from its last checkpoint.
         """
         return self._link.saving_asked

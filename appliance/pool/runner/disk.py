@@ -37,14 +37,17 @@ class Disk:
 
     Args:
         volumes: the folder that the volumes are mounted in.
+        cache: the folder that runs cache in, watched like a volume.
         beside: the folder of the runner's socket.
         reserve_mb: what is to be left free on the disk of the volumes, MB; 0: they are not watched.
     """
 
-    def __init__(self, volumes: Path, *, beside: Path, reserve_mb: int) -> None:
+    def __init__(self, volumes: Path, cache: Path | None = None, *, beside: Path, reserve_mb: int) -> None:
         self._reserve = reserve_mb * MB
         self._beside = beside
         self._mounts = sorted(volumes.iterdir()) if reserve_mb and volumes.is_dir() else []
+        if reserve_mb and cache is not None:
+            self._mounts.append(cache)
         # All are on one disk, unless somebody has moved one of them.
         self._disks = list({each.stat().st_dev: each for each in self._mounts}.values())
         self._since = 0.0

@@ -30,8 +30,8 @@ from .limits import HEADROOM, address_space
 from .link import CallError
 from .spec import Skill, Spec
 
-IMPORT_S = 10.0
-"""Longest import of one module or handler."""
+FIRST_S = 10.0
+"""Longest that a rehearsal takes to begin with its first item."""
 HUGE = 2 * 2**20
 """A huge page of x86-64 and of arm64 with 4 KiB pages."""
 WORTH_MB = 24
@@ -169,17 +169,18 @@ class Loaded:
             if problem:
                 self.problems[name] = problem
                 tell(f"problem\t{name}\t{problem}")
-            if (now := _threads()) > threads:
+            now = _threads()
+            if started := now - threads:
                 self.problems[f"threads of {name}"] = (
-                    f"it started {now - threads} threads, which do not live through a fork and may hold locks for ever"
+                    f"it started {len(started)} threads, which do not live through a fork and may hold locks for ever"
                 )
-                threads = now
+            threads = now
 
     def _items(self) -> Iterator[Item]:
         for module in self.spec.modules:
-            yield f"module {module}", IMPORT_S, lambda module=module: _import(module)
+            yield f"module {module}", self.spec.import_s, lambda module=module: _import(module)
         for skill in self.spec.skills.values():
-            yield skill.name, IMPORT_S, lambda skill=skill: self._import_handler(skill)
+            yield skill.name, self.spec.import_s, lambda skill=skill: self._import_handler(skill)
         for skill in self.spec.skills.values():
             handler = self.handlers.get(skill.name)
             if handler is None or not callable(getattr(handler, "preload", None)):
@@ -274,7 +275,7 @@ def _tell(fd: int, line: str) -> None:
 def _attend(fd: int, pid: int, problems: dict[str, str]) -> tuple[str, str]:
     """Follow a rehearsal and note its problems; returns the item that it did not survive and why, or no reason."""
     item, rest = "", b""
-    limit_s, until = IMPORT_S, time.monotonic() + IMPORT_S
+    limit_s, until = FIRST_S, time.monotonic() + FIRST_S
     while True:
         # A little more than it has itself, so that what can end by itself does.
         if not select.select([fd], [], [], max(0.0, until + 0.5 - time.monotonic()))[0]:
@@ -298,8 +299,9 @@ def _attend(fd: int, pid: int, problems: dict[str, str]) -> tuple[str, str]:
     return item, ENDED + (f"killed by {signal.Signals(-code).name}" if code < 0 else f"left with status {code}")
 
 
-def _threads() -> int:
-    return len(os.listdir("/proc/self/task"))  # noqa: PTH208 - a count of names
+def _threads() -> set[str]:
+    """Return the ids of this process's threads: by their number alone, one that ends would hide one that starts."""
+    return set(os.listdir("/proc/self/task"))  # noqa: PTH208 - names are all that is wanted
 
 
 def resident() -> int:

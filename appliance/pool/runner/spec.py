@@ -17,7 +17,7 @@ class Skill:
         self.name = name
         self.folder = Path(str(table["folder"]))
         self.loads = tuple(str(each) for each in table.get("loads") or ())
-        """Files that its `preload` reads; one that is missing is told before it is called."""
+        """Files that its `preload` reads; one that is missing is reported before it is called."""
         self.preload_mb = int(table.get("preload_mb", 0))
         """Memory that its `preload` may take; 0: it has none."""
         self.preload_s = float(table.get("preload_s", 10.0))
@@ -26,7 +26,7 @@ class Skill:
 
 
 class Spec:
-    """All that a zygote is told at its start."""
+    """All that a zygote reads at its start."""
 
     def __init__(self, table: Table) -> None:
         skills = cast("dict[str, Table]", table.get("skills") or {})
@@ -37,8 +37,14 @@ class Spec:
         self.modules = tuple(str(each) for each in table.get("modules") or ())
         self.site = cast("Table", table.get("site") or {})
         self.volumes = Path(str(table.get("volumes") or "/volumes"))
+        self.folders = Path(str(table.get("folders") or "/folders"))
+        """Where the folders of the gateway's machine are mounted."""
+        self.cache = Path(str(table["cache"])) if table.get("cache") else None
+        """Where runs keep what they can work out again; None: nowhere."""
         self.reserve_mb = int(table.get("reserve_mb", 0))
         """What is to be left free on the disk of the volumes, MB; 0: it is not watched."""
+        self.import_s = float(table.get("import_s", 10.0))
+        """Longest import of one module or handler."""
         self.patience_s = float(table.get("patience_s", 15.0))
         """Time for everything that is loaded beforehand, together."""
         self.proven = bool(table.get("proven", False))

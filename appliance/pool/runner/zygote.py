@@ -55,7 +55,9 @@ class Zygote:
         self._scratch = scratch
         self._processes = processes
         self._alone = os.getpid() == 1
-        self._disk = Disk(loaded.spec.volumes, beside=Path(path).parent, reserve_mb=loaded.spec.reserve_mb)
+        self._disk = Disk(
+            loaded.spec.volumes, loaded.spec.cache, beside=Path(path).parent, reserve_mb=loaded.spec.reserve_mb
+        )
         self._own: frozenset[str] = frozenset()
         """What lies beside the socket and is to stay there."""
         self._connections: dict[int, Connection] = {}
@@ -76,7 +78,7 @@ class Zygote:
         signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # for the children, until they can heed it
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._asked_to_stop)
-        # Under its name only when somebody listens: whoever sees it can connect.
+        # Under its name only when somebody listens: a client that sees it can connect.
         early = f"{self._path}.new"
         with contextlib.suppress(FileNotFoundError):
             Path(early).unlink()
@@ -114,7 +116,7 @@ class Zygote:
         del number, frame
         self._stopping = True
         if self._run is not None:
-            # Nobody called the run off: whoever ordered it may repeat it elsewhere.
+            # Nobody called the run off: its coordinator may repeat it elsewhere.
             self._run.end(4, GRACE_S)
 
     def _patience(self) -> float:

@@ -6,25 +6,21 @@ off learns what it missed before long; what it knew itself it has on disk.
 
 import asyncio
 import random
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Sequence, Set
 from typing import Any
 
 import structlog
 
+from appliance.background import Background
 from appliance.errors import SwiftbotError
-from appliance.model import Lease, RobotCommand, SoftStop
+from appliance.identity.member import SENDER
+from appliance.model import Lease, RobotCommand, SoftStop, keyspace
+from appliance.model.robot_api import ResumeRobotsAsk, Standing, StandingAsk, StopAnswer, StopAsk
+from appliance.model.roles import Role
+from appliance.model.steering import MAX_STOPPED
+from appliance.plane.events import AuthorityChanged, FleetEvent, Joined, Relinked, Stage
 from appliance.plane.node import Plane
-from appliance.robots.api import (
-    DriveAsk,
-    GiveAsk,
-    RenewAsk,
-    ResumeRobotsAsk,
-    Standing,
-    StandingAsk,
-    StopAnswer,
-    StopAsk,
-    TakeAsk,
-)
 from appliance.robots.authority.lease import Leasing
 from appliance.robots.authority.soft_stop import Stopping
 
@@ -40,10 +36,14 @@ SHOWN = 32
 
 
 class Authority:
-    """One per gateway. `on_change` is called when a robot is stopped, freed, taken over or given back."""
+    """One per gateway. Publishes `AuthorityChanged` when a robot is stopped, freed, taken over or given back."""
 
     def __init__(
-        self, plane: Plane, *, orders: Callable[[str, RobotCommand], RobotCommand] = lambda _, command: command
+        self,
+        plane: Plane,
+        *,
+        orders: Callable[[str, RobotCommand], RobotCommand] = lambda _, command: command,
+        out_of_use: Callable[[str], str] = lambda _: "",
     ) -> None:
         """Make it.
 
@@ -51,12 +51,13 @@ class Authority:
             plane: the fleet.
             orders: returns an operator's order as it may be sent to a robot; raises a SwiftbotError with the reason
                 when it may not be.
+            out_of_use: why a robot is in maintenance; "" when it is not.
         """
+        self._out_of_use = out_of_use
         self._plane = plane
-        self.on_change: list[Callable[[], None]] = []
         self._stopping = Stopping(plane, changed=self._changed)
         self._leasing = Leasing(plane, changed=self._changed, refuses=self.refuses, orders=orders)
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Background()
 
     async def start(self, signed: Callable[[str, Any], Any] = lambda _, handler: handler) -> None:
         """Take up what was kept, listen, answer the verbs, and ask those who are there for what they know.
@@ -67,24 +68,49 @@ class Authority:
         await self._stopping.start()
         self._leasing.start()
         rpc = self._plane.rpc
-        rpc.register("soft_stop", StopAsk, signed("soft_stop", self._stopping.stop))
-        rpc.register("soft_resume", ResumeRobotsAsk, signed("soft_resume", self._resume))
-        rpc.register("standing", StandingAsk, self._standing)
-        rpc.register("control_take", TakeAsk, signed("control_take", self._leasing.take))
-        rpc.register("control_renew", RenewAsk, self._leasing.renew)
-        rpc.register("control_move", DriveAsk, self._leasing.move)
-        rpc.register("control_give", GiveAsk, signed("control_give", self._leasing.give))
-        self._plane.on_member_joined.append(self._met)
+        rpc.register(keyspace.SOFT_STOP, signed("soft_stop", self._stopping.stop))
+        rpc.register(keyspace.SOFT_RESUME, signed("soft_resume", self._resume))
+        rpc.register(keyspace.STANDING, self._standing)
+        rpc.register(keyspace.CONTROL_TAKE, signed("control_take", self._leasing.take))
+        rpc.register(keyspace.CONTROL_RENEW, self._leasing.renew)
+        rpc.register(keyspace.CONTROL_MOVE, self._leasing.move)
+        rpc.register(keyspace.CONTROL_GIVE, signed("control_give", self._leasing.give))
+        self._plane.events.subscribe(Stage.ROBOTS, self._on_event)
         for member in self._plane.members() - {self._plane.gateway}:
             self._met(member)
 
     async def close(self) -> None:
         """Listen no more."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
         await self._leasing.close()
         await self._stopping.close()
+
+    async def hold_revoked(self, robots: Set[str]) -> None:
+        """Stop those that are online of robots whose certificates have just been revoked: one that moves would go on.
+
+        What comes of it is logged, for the operators who see the log.
+        """
+        roster, credentials = self._plane.registry.robots, self._plane.session.credentials
+        online = sorted(each for each in robots if each in roster and roster[each].online)
+        if not online or credentials is None:
+            return
+        number = credentials.roster.number
+        parts = (tuple(online[start : start + MAX_STOPPED]) for start in range(0, len(online), MAX_STOPPED))
+        await asyncio.gather(*(self._hold_revoked(part, number) for part in parts))
+
+    async def _hold_revoked(self, online: tuple[str, ...], number: int) -> None:
+        # One stop of all gateways that see the same robots online; of others under its id theirs would be lost.
+        act = f"o-revoked-{number}-{zlib.crc32('/'.join(online).encode()):08x}"
+        ask = StopAsk(robots=online, by="swiftbot", why="its certificate is revoked", act=act)
+        try:
+            answer = await self._plane.rpc.call(self._plane.gateway, keyspace.SOFT_STOP, ask)
+        except SwiftbotError as error:
+            log.warning("revoked robots are not stopped: use the switch at each", robots=online, reason=str(error))
+            return
+        for robot in online:
+            if (problem := answer.problems.get(robot, "")) or robot not in answer.robots:
+                problem = problem or "it does not answer"
+                log.warning("a revoked robot may not hold: look at it, or use its switch", robot=robot, reason=problem)
 
     # --- questions ----------------------------------------------------------------------------------------------
 
@@ -114,6 +140,8 @@ class Authority:
         lease = self._leasing.leases.of(robot)
         if lease is not None:
             return lease.text
+        if why := self._out_of_use(robot):
+            return why
         info = self._plane.registry.robots.get(robot)
         # A pilot or a failsafe at the vehicle itself (`robots.mavlink.control`).
         return f"taken at the vehicle: {info.seized}" if info is not None and info.online and info.seized else ""
@@ -128,7 +156,7 @@ class Authority:
         lease = self._leasing.leases.of(robot)
         if lease is None or (lease.id == command.lease and self._leasing.leases.over(robot)):
             # Its operator does not have the robot any more: perhaps a task has.
-            return "no longer under that lease" if command.lease else ""
+            return "no longer under that lease" if command.lease else self._out_of_use(robot)
         return lease.text if command.lease != lease.id else ""
 
     # --- verbs --------------------------------------------------------------------------------------------------
@@ -137,9 +165,14 @@ class Authority:
         return await self._stopping.resume(ask, self._learn)
 
     async def _standing(self, ask: StandingAsk) -> Standing:
-        """Answer `standing`: what is known here, with what the asker knows."""
-        await self._stopping.merge(ask.stops, ask.lifted)
-        self._leasing.merge(ask.leases)
+        """Answer `standing`: what is known here, with what the asker knows.
+
+        Only gateways are believed, all are answered: an operator who lifts a stop says so by `soft_resume`.
+        """
+        sender = SENDER.get()
+        if sender is None or sender.role is Role.GATEWAY:
+            await self._stopping.merge(ask.stops, ask.lifted)
+            self._leasing.merge(ask.leases)
         return self._all()
 
     def _all(self) -> Standing:
@@ -148,12 +181,14 @@ class Authority:
 
     # --- meeting ------------------------------------------------------------------------------------------------
 
+    def _on_event(self, event: FleetEvent) -> None:
+        if isinstance(event, Joined | Relinked):
+            self._met(event.gateway)
+
     def _met(self, member: str) -> None:
         if member == self._plane.gateway:
             return
-        task = asyncio.create_task(self._compare(member, MEET_S), name=f"soft stops of {member}")
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._tasks.start(self._compare(member, MEET_S), f"soft stops of {member}")
 
     async def _compare(self, member: str, pause_s: float) -> None:
         """Tell another gateway all that is known here, and take in what it knows."""
@@ -162,7 +197,7 @@ class Authority:
         ask = StandingAsk(stops=mine.stops, lifted=mine.lifted, leases=mine.leases)
         for _ in range(3):
             try:
-                found = await self._plane.rpc.call(member, "standing", ask, Standing, timeout_s=LEARN_S)
+                found = await self._plane.rpc.call(member, keyspace.STANDING, ask, timeout_s=LEARN_S)
             except SwiftbotError as error:
                 log.info("a gateway does not tell its soft stops", member=member, reason=str(error))
                 if member not in self._plane.members():
@@ -178,7 +213,7 @@ class Authority:
 
         async def ask(member: str) -> None:
             try:
-                found = await self._plane.rpc.call(member, "standing", StandingAsk(), Standing, timeout_s=LEARN_S)
+                found = await self._plane.rpc.call(member, keyspace.STANDING, StandingAsk(), timeout_s=LEARN_S)
             except SwiftbotError:
                 return
             await self._stopping.merge(found.stops, found.lifted)
@@ -186,5 +221,4 @@ class Authority:
         await asyncio.gather(*(ask(each) for each in self._plane.members() - {self._plane.gateway}))
 
     def _changed(self) -> None:
-        for callback in tuple(self.on_change):
-            callback()
+        self._plane.events.publish(AuthorityChanged())

@@ -1,8 +1,8 @@
 """Leases: which operator has taken which robot over, and until when.
 
-Who takes a robot over is decided by compare-and-set on `lease/{robot}`; the rest is told. `Leases` is one gateway's
-view, by its own clock (pure, the clock is passed in): a lease that is heard of counts from then, whatever its giver's
-clock says; so it may hold a little longer than its operator thinks, never shorter than its renewals allow.
+Who takes a robot over is decided by compare-and-set on `lease/{robot}`; the rest is published. `Leases` is one
+gateway's view, by its own clock (pure, the clock is passed in): a lease that is heard of counts from then, whatever its
+giver's clock says; so it may hold a little longer than its operator thinks, never shorter than its renewals allow.
 
 A lease that is not renewed ends by each gateway's own clock; the one that owns the robot's key then has it hold, and
 says so. Commands under a lease go through the gateway that the operator's tool asks, which checks it first.
@@ -19,12 +19,13 @@ import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
+from appliance.background import Background
 from appliance.errors import ConflictError, NotFoundError, RefusedError, SwiftbotError, UnreachableError
-from appliance.model import Lease, RobotCommand, RobotReply, encode
+from appliance.model import Lease, RobotCommand, RobotReply, encode, keyspace
+from appliance.model.robot_api import DriveAsk, GiveAsk, RenewAsk, TakeAsk
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer
-from appliance.robots.api import DriveAsk, GiveAsk, RenewAsk, TakeAsk
 from appliance.robots.sender import send_command, tell_to_hold
 
 MOST = 1024
@@ -66,7 +67,7 @@ class Leases:
         return max(0.0, held.until - now) if held is not None else 0.0
 
     def over(self, robot: str) -> bool:
-        """Whether the lease of a robot was found due; the robot is nobody's until its end is told."""
+        """Whether the lease of a robot was found due; the robot is nobody's until its end is published."""
         held = self._held.get(robot)
         return held is not None and held.over
 
@@ -166,11 +167,11 @@ class Leasing:
         self._numbers = itertools.count(1)
         self._closer: Closer | None = None
         self._ticking: asyncio.Task[None] | None = None
-        self._ending: set[asyncio.Task[None]] = set()
+        self._ending = Background()
 
     def start(self) -> None:
         """Listen, and look at the clock."""
-        self._closer = self._plane.session.subscribe_typed(self._plane.keys.lease(), Lease, self._on_lease)
+        self._closer = self._plane.session.subscribe_typed(keyspace.LEASE, self._on_lease)
         self._ticking = asyncio.create_task(self._tick(), name="leases of robots")
 
     async def close(self) -> None:
@@ -180,9 +181,7 @@ class Leasing:
         if self._ticking is not None:
             self._ticking.cancel()
             await asyncio.gather(self._ticking, return_exceptions=True)
-        for task in self._ending:
-            task.cancel()
-        await asyncio.gather(*self._ending, return_exceptions=True)
+        await self._ending.close()
 
     def merge(self, leases: tuple[Lease, ...]) -> None:
         """Take in what another gateway knows."""
@@ -214,7 +213,8 @@ class Leasing:
         try:
             stored = await self._plane.dht.read(_key(ask.robot))
         except UnreachableError as error:
-            # Whoever may have it does not answer: an operator must not wait for that. Where it turns up, it conflicts.
+            # The gateway that may have it does not answer: an operator must not wait for that. Where it turns up, it
+            # conflicts.
             log.warning("robot taken over unread", robot=ask.robot, reason=str(error))
             stored = None
         known = _read(stored.value) if stored is not None and not stored.deleted else None
@@ -226,7 +226,7 @@ class Leasing:
         if known is None or known.id != lease.id:
             await self._write_taken(lease, stored)
         self._hear(lease)
-        self._plane.session.put(self._plane.keys.lease(lease.robot), encode(lease))
+        self._plane.session.publish(keyspace.LEASE, lease, lease.robot)
         log.warning("robot taken over", robot=lease.robot, by=lease.by, why=lease.why, lease_s=lease.lease_s)
         await self._have_hold(lease.robot, lease.id)
         return lease
@@ -258,7 +258,7 @@ class Leasing:
             raise _over(ask.robot)
         renewed = replace(held, renewal=held.renewal + 1)
         self._hear(renewed)
-        self._plane.session.put(self._plane.keys.lease(renewed.robot), encode(renewed))
+        self._plane.session.publish(keyspace.LEASE, renewed, renewed.robot)
         return renewed
 
     async def give(self, ask: GiveAsk) -> Lease:
@@ -335,13 +335,11 @@ class Leasing:
                 log.exception("looking at the leases broke; it goes on")
 
     def _look(self, now: float) -> None:
-        """Have robots hold whose lease is over; only when that is told, or after a grace, are they the tasks' again."""
+        """Have robots hold whose lease is over; tasks have them back once that is published, or after a grace."""
         for each in self.leases.due(now):
             if self._plane.dht.owns(f"robot/{each.robot}"):
                 log.warning("a lease was not renewed: the robot holds", robot=each.robot, by=each.by)
-                task = asyncio.create_task(self._end_over(self.leases.end(each)), name=f"lease of {each.robot}")
-                self._ending.add(task)
-                task.add_done_callback(self._ending.discard)
+                self._ending.start(self._end_over(self.leases.end(each)), f"lease of {each.robot}")
         if gone := self.leases.expire(now, GRACE_S):
             for each in gone:
                 log.warning("a lease is over, and nobody told its end: the robot is free", robot=each.robot, by=each.by)
@@ -358,7 +356,7 @@ class Leasing:
 
     async def _end(self, ended: Lease) -> Lease:
         self._hear(ended)
-        self._plane.session.put(self._plane.keys.lease(ended.robot), encode(ended))
+        self._plane.session.publish(keyspace.LEASE, ended, ended.robot)
         stored = await self._plane.dht.read(_key(ended.robot))
         known = _read(stored.value) if stored is not None and not stored.deleted else None
         if stored is not None and known is not None and known.id == ended.id:
@@ -380,7 +378,7 @@ def _over(robot: str) -> ConflictError:
 
 
 def _key(robot: str) -> str:
-    return f"lease/{robot}"
+    return keyspace.LEASE_RECORD.prefix + robot
 
 
 def _read(value: bytes) -> Lease | None:

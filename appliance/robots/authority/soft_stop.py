@@ -2,11 +2,11 @@
 
 Which robots are stopped is an observed-remove set (Shapiro et al., "A comprehensive study of convergent and commutative
 replicated data types", 2011, section 3.3.5), which any two gateways merge to the same (`Stops`, pure): a lifting names
-the stops that whoever lifted them had seen, so one that was given meanwhile elsewhere, behind a partition too, stays in
-force. No clock has a part in it. What is forgotten of liftings, beyond `MOST`, can only bring a stop back, never lose
-one.
+the stops that the operator who lifted them had seen, so one that was given meanwhile elsewhere, behind a partition too,
+stays in force. No clock has a part in it. What is forgotten of liftings, beyond `MOST`, can only bring a stop back,
+never lose one.
 
-A stop is put by whoever gives it before anybody is asked, so each gateway that hears it acts on it by itself; the
+A stop is published before any gateway is asked, so each gateway that hears it acts on it by itself; the
 gateway that is asked besides confirms which others have it on disk and which robots hold. What was missed is made up
 for when gateways meet (`authority`).
 """
@@ -15,23 +15,26 @@ import asyncio
 import itertools
 import time
 import uuid
-from collections.abc import Awaitable, Callable, Coroutine, Iterable
-from typing import Any
+from collections.abc import Awaitable, Callable, Iterable
 
 import msgspec
 import structlog
 
+from appliance.background import Background
 from appliance.errors import RefusedError, SwiftbotError
-from appliance.model import Lifted, SoftStop, encode
+from appliance.model import Lifted, SoftStop, encode, keyspace
+from appliance.model.robot_api import ResumeRobotsAsk, StandingAsk, StopAnswer, StopAsk
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer
-from appliance.robots.api import ResumeRobotsAsk, Standing, StandingAsk, StopAnswer, StopAsk
 from appliance.robots.sender import tell_to_hold
 
 MOST = 1024
 """Stops and liftings that are remembered, each: years of use, and what a flood can cost."""
 RESERVE = 64
 """Of these, only for stops of the whole fleet: however many robots are stopped one by one, it can still be stopped."""
+MOST_OPERATORS = 1024
+"""Beyond `MOST` each operator has room for one stop of the whole fleet: it ends when that one is lifted, and not with
+the stops of others. So many operators have it."""
 
 
 class Stops:
@@ -64,6 +67,8 @@ class Stops:
     def room(self, stop: SoftStop) -> bool:
         """Whether a stop can be remembered, or is; what has no effect any more is forgotten for it."""
         most = MOST - RESERVE if stop.robots else MOST
+        if not stop.robots and len(self._stops) >= MOST and self.whole_of(stop.by) is None:
+            most += MOST_OPERATORS
         if stop.id not in self._stops and len(self._stops) >= most:
             self.forget(most - 1)
         return stop.id in self._stops or len(self._stops) < most
@@ -113,6 +118,11 @@ class Stops:
     def whole(self) -> SoftStop | None:
         """A stop of the fleet that is lifted for no robot, or None."""
         return next((each for each in self.active if not each.robots and not self._of.get(each.id)), None)
+
+    def whole_of(self, operator: str) -> SoftStop | None:
+        """A stop of the fleet that this operator gave and that is lifted for no robot, or None."""
+        found = (each for each in self.active if not each.robots and not self._of.get(each.id))
+        return next((each for each in found if each.by == operator), None)
 
     def ended(self, stop: str, robots: Iterable[str]) -> bool:
         """Whether a stop is known to hold none of those robots any more; one never heard of is not known to."""
@@ -168,6 +178,10 @@ AGAIN_S = (0.0, 0.5, 1.0)
 EVERY_S = 1.0
 """The pauses after these, as long as the stop is in force: for robots and gateways that were away."""
 _ABSENT = "it is not in the roster and could not be told; it will be if it comes while the stop is in force"
+_REVOKED = (
+    "its certificate is revoked, and it is still linked: it was told to hold and says that it does, which is not "
+    "believed; look at it"
+)
 _AWAY = (
     "it is offline and could not be told; it will be when it is back while the stop is in force, and until then its "
     "own failsafe has it"
@@ -182,7 +196,7 @@ class Stopping:
         self._changed = changed
         self.stops = Stops()
         self._closers: list[Closer] = []
-        self._tasks: set[asyncio.Task[Any]] = set()
+        self._tasks = Background()
         self._held: dict[str, set[str]] = {}
         """Stop that is pursued -> robots that have confirmed that they hold, and are here since."""
         self._writing = asyncio.Lock()
@@ -196,10 +210,10 @@ class Stopping:
                 log.warning("kept soft stops cannot be read; the others are asked", reason=str(error))
                 continue
             self.stops.merge(kept.stops, kept.lifted)
-        session, keys = self._plane.session, self._plane.keys
+        session = self._plane.session
         self._closers = [
-            session.subscribe_typed(keys.soft_stop(), SoftStop, self._on_stop),
-            session.subscribe_typed(keys.lifted(), Lifted, self._on_lifted),
+            session.subscribe_typed(keyspace.STOP, self._on_stop),
+            session.subscribe_typed(keyspace.LIFTED, self._on_lifted),
         ]
         for each in self.stops.active:
             self._pursue(each)
@@ -208,9 +222,7 @@ class Stopping:
         """Listen no more."""
         for closer in self._closers:
             closer.close()
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
 
     async def merge(self, stops: Iterable[SoftStop], lifted: Iterable[Lifted]) -> None:
         """Take in what another gateway knows; on disk when it returns."""
@@ -232,22 +244,29 @@ class Stopping:
             at_ns=time.time_ns(),
         )
         if not self.stops.room(stop):
-            standing = self.stops.whole if not stop.robots else None
+            standing = self.stops.whole_of(stop.by) if not stop.robots else None
             if standing is None:
                 known = len(self.stops.active)
                 raise RefusedError(f"{known} soft stops are in force already", remedy="`swiftbot resume` lifts them")
-            stop = standing  # The fleet is stopped: its robots are told again.
+            stop = standing  # This operator has stopped the fleet already: its robots get that stop again.
         self.stops.add(stop)
         self._changed()
-        self._plane.session.put(self._plane.keys.soft_stop(stop.id), encode(stop))
+        self._plane.session.publish(keyspace.STOP, stop, stop.id)
         roster = self._plane.registry.robots
         names = [each for each, info in roster.items() if info.online and self.stops.holds(stop, each)]
-        telling = tell_to_hold(self._plane.session, names, act=stop.id)
-        _, confirmed, told = await asyncio.gather(self._keep(), self._confirm((stop,), ()), telling)
+        # A revoked robot counts as offline, and may be linked and moving all the same.
+        revoked = self._revoked(stop)
+        _, confirmed, told, (linked, _) = await asyncio.gather(
+            self._keep(),
+            self._confirm((stop,), ()),
+            tell_to_hold(self._plane.session, names, act=stop.id),
+            tell_to_hold(self._plane.session, revoked, act=stop.id),
+        )
         held, problems = told
         problems |= {each: _ABSENT for each in stop.robots if each not in roster}
         away = [each for each, info in roster.items() if not info.online and self.stops.holds(stop, each)]
         problems |= dict.fromkeys(away, _AWAY)
+        problems |= dict.fromkeys(linked, _REVOKED)
         log.warning("soft stop", by=stop.by, why=stop.why, robots=list(stop.robots) or "the fleet", held=list(held))
         self._pursue(stop, held)
         return StopAnswer(
@@ -277,7 +296,7 @@ class Stopping:
         )
         self.stops.lift(lifted)
         await self._keep()
-        self._plane.session.put(self._plane.keys.lifted(lifted.id), encode(lifted))
+        self._plane.session.publish(keyspace.LIFTED, lifted, lifted.id)
         self._changed()
         log.warning("soft stop lifted", by=lifted.by, why=lifted.why, robots=list(lifted.robots) or "all that it held")
         confirmed, silent = await self._confirm((), (lifted,))
@@ -289,7 +308,7 @@ class Stopping:
         if not key.endswith(f"/{stop.id}") or not self.stops.room(stop):
             self._plane.session.refuse("misplaced operator/stop/*", key=key, says=stop.id)
             return
-        self._later(self.merge((stop,), ()))
+        self._tasks.start(self.merge((stop,), ()), "soft stop")
 
     def _on_lifted(self, key: str, lifted: Lifted | None) -> None:
         if lifted is None:
@@ -297,14 +316,30 @@ class Stopping:
         if not key.endswith(f"/{lifted.id}"):
             self._plane.session.refuse("misplaced operator/resume/*", key=key, says=lifted.id)
             return
-        self._later(self.merge((), (lifted,)))
+        self._tasks.start(self.merge((), (lifted,)), "soft stop")
 
     def _pursue(self, stop: SoftStop, held: Iterable[str] = ()) -> None:
         """Have the robots of a stop hold, once and for as long as it is in force."""
         if stop.id not in self._held:
             self._held[stop.id] = set()
-            self._later(self._have_hold(stop))
+            self._tasks.start(self._have_hold(stop), "soft stop")
+            self._tasks.start(self._have_revoked_hold(stop), "soft stop of revoked robots")
         self._held[stop.id].update(held)
+
+    def _revoked(self, stop: SoftStop) -> set[str]:
+        """The robots of a stop whose certificate is revoked."""
+        credentials = self._plane.session.credentials
+        return {each for each in credentials.barred if self.stops.holds(stop, each)} if credentials else set()
+
+    async def _have_revoked_hold(self, stop: SoftStop) -> None:
+        """Tell the revoked robots that this gateway answers for, a few times; no other waits for their answers."""
+        left = {each for each in self._revoked(stop) if self._mine(each, "")}
+        for pause_s in AGAIN_S if left else ():
+            await asyncio.sleep(pause_s)
+            if not self.stops.in_force(stop.id):
+                return
+            linked, _ = await tell_to_hold(self._plane.session, left, act=stop.id)
+            left.difference_update(linked)
 
     async def _have_hold(self, stop: SoftStop) -> None:
         """Tell the robots that this gateway answers for until each has said that it holds, and who comes back again."""
@@ -345,7 +380,7 @@ class Stopping:
 
         async def tell(member: str) -> bool:
             try:
-                await self._plane.rpc.call(member, "standing", ask, Standing, timeout_s=CONFIRM_S)
+                await self._plane.rpc.call(member, keyspace.STANDING, ask, timeout_s=CONFIRM_S)
             except SwiftbotError as error:
                 log.warning("a gateway does not confirm a soft stop", member=member, reason=str(error))
                 return False
@@ -359,13 +394,3 @@ class Stopping:
         async with self._writing:
             kept = StandingAsk(stops=self.stops.stops, lifted=self.stops.lifted)
             await self._plane.store.put(STORED, encode(kept))
-
-    def _later(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._done)
-
-    def _done(self, task: "asyncio.Task[Any]") -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            log.error("what follows from a soft stop broke", exc_info=error)

@@ -12,7 +12,7 @@ import msgspec
 import structlog
 
 from appliance.model import Site
-from appliance.robots.executor import Done, Verb
+from appliance.robots.executor import Done, Terms, Verb, verb
 from appliance.robots.limits import check_way
 from appliance.robots.mavlink import dialect, protocols
 from appliance.robots.mavlink.controller import ManualControl, VehicleController
@@ -40,6 +40,7 @@ class Copter:
         self._craft = craft
         self._missions = missions
 
+    @verb()
     async def goto(self, args: GotoArgs) -> Done:
         """Fly through the waypoints by an uploaded mission and wait for arrival at the last."""
         craft = self._craft
@@ -48,6 +49,7 @@ class Copter:
         await self._missions.fly("goto", way, args.speed_mps)
         return Done({"waypoints": len(way), "distance_m": round(craft.distance(way[-1]), 2)} | craft.where())
 
+    @verb()
     async def takeoff(self, args: TakeoffArgs) -> Done:
         """Climb to an altitude above home; from the air: climb or sink there."""
         craft = self._craft
@@ -78,6 +80,7 @@ class Copter:
         await craft.travel("takeoff", guided, there, lambda: abs(vehicle.relative_m - altitude))
         return Done({"altitude_m": round(vehicle.relative_m, 2)} | craft.where())
 
+    @verb(Terms(safe=True))
     async def land(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         """Come down where it is, until it has disarmed."""
         craft = self._craft
@@ -89,6 +92,7 @@ class Copter:
             )
         return Done({"landed": True} | craft.where())
 
+    @verb(Terms(safe=True))
     async def return_home(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         """Fly home and land, until it has disarmed."""
         craft = self._craft
@@ -117,6 +121,7 @@ class Rover:
         self._craft = craft
         self._missions = missions
 
+    @verb()
     async def goto(self, args: GotoArgs) -> Done:
         """Drive through the waypoints and wait for arrival at the last."""
         craft = self._craft
@@ -125,6 +130,7 @@ class Rover:
         await self._missions.fly("goto", way, args.speed_mps)
         return Done({"waypoints": len(way), "distance_m": round(craft.distance(way[-1]), 2)} | craft.where())
 
+    @verb(Terms(safe=True))
     async def return_home(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         """Drive home and stand there."""
         craft = self._craft
@@ -171,6 +177,7 @@ class CommandDispatcher:
         self._missions = missions
         self._copter = Copter(self._craft, missions)
         self._rover = Rover(self._craft, missions)
+        self._manual = ManualControl(self._craft)
         self._payload = Payload(self._craft)
 
     def ready(self) -> None:
@@ -183,38 +190,20 @@ class CommandDispatcher:
 
     def verbs(self) -> dict[str, Verb]:
         """Return what it can do; only `state` for vehicles whose modes are not known here."""
-        found = {"state": Verb(run=self.state)}
-        if not self._vehicle.commandable:
-            return found
-        verb = self._craft.verb
-        if self._vehicle.flies:
-            found |= {
-                "goto": verb(self._copter.goto),
-                "takeoff": verb(self._copter.takeoff),
-                "land": verb(self._copter.land, safe=True),
-                "return_home": verb(self._copter.return_home, safe=True),
-                "orbit": verb(self._missions.orbit),
-            }
-        else:
-            found |= {"goto": verb(self._rover.goto), "return_home": verb(self._rover.return_home, safe=True)}
-        return found | {
-            "hold": verb(self.hold, preempts=True),
-            "velocity": verb(ManualControl(self._craft).velocity, resumable=False, preempts=True),
-            "arm": verb(self.arm),
-            "disarm": verb(self.disarm, safe=True),
-            "mission": verb(self._missions.mission),
-            "set_mode": verb(self.set_mode, preempts=True),
-            "parameter": Verb(run=self.parameter, resumable=True),
-            "release": Verb(run=self.release, resumable=True),
-            **self._payload.verbs(),
-        }
+        found = self._craft.verbs_of(self, *self._parts())
+        return found if self._vehicle.commandable else {"state": found["state"]}
 
+    def _parts(self) -> tuple[object, ...]:
+        return (self._copter if self._vehicle.flies else self._rover, self._missions, self._manual, self._payload)
+
+    @verb(Terms(uses=(), guarded=False, resumable=False))
     async def state(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         """Say what is known of it."""
         info = self._vehicle.info("", tuple(self.verbs()))
         said = {"flies": info.flies, "armed": info.armed, "online": info.online}
         return Done({**msgspec.to_builtins(info), **said} | self._craft.where())
 
+    @verb(Terms(preempts=True))
     async def hold(self, args: HoldArgs) -> Done:
         """Stop where it is; with a duration, stay that long."""
         in_range("hold", "duration_s", args.duration_s, 0.0, _MAX_HOLD_S)
@@ -222,6 +211,7 @@ class CommandDispatcher:
         await asyncio.sleep(args.duration_s or 0.0)
         return Done({"held_s": args.duration_s or 0.0} | self._craft.where())
 
+    @verb()
     async def arm(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         """Arm the motors, when nothing speaks against it."""
         if not self._vehicle.armed:
@@ -229,6 +219,7 @@ class CommandDispatcher:
             await self._craft.arm()
         return Done(self._craft.where())
 
+    @verb(Terms(safe=True))
     async def disarm(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         """Disarm; the autopilot refuses in the air."""
         if self._vehicle.armed:
@@ -242,6 +233,7 @@ class CommandDispatcher:
             await self._craft.confirm(lambda: not self._vehicle.armed)
         return Done(self._craft.where())
 
+    @verb(Terms(preempts=True))
     async def set_mode(self, args: ModeArgs) -> Done:
         """Change the mode. It ends what the base does, and the mode counts as the gateway's own."""
         modes = self._craft.modes
@@ -264,6 +256,7 @@ class CommandDispatcher:
         await self._craft.mode(name)
         return Done(self._craft.where())
 
+    @verb(Terms(uses=(), guarded=False))
     async def parameter(self, args: ParameterArgs) -> Done:
         """Read or write one of the autopilot's parameters; written only while it stands disarmed."""
         name = protocols.check_name(args.name)
@@ -277,6 +270,7 @@ class CommandDispatcher:
             {"name": name, "value": await protocols.write_parameter(self._vehicle, name, args.value, patience=patience)}
         )
 
+    @verb(Terms(uses=(), guarded=False))
     async def release(self, args: NoArgs) -> Done:  # noqa: ARG002 - verbs have one shape
         """Take the vehicle back from a pilot; a failsafe that is in force keeps it."""
         if self._vehicle.condition.failsafe and self._vehicle.armed:

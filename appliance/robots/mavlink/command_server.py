@@ -17,8 +17,8 @@ between. A repetition is the same command, byte for byte, with `confirmation` ab
 there it is what comes within `REPEAT_S` of the answer. While the first is being handed in the answer to either is
 IN_PROGRESS.
 
-How a task goes on is told to its sender by STATUSTEXT (`Progress`), over a restart too: a gateway that was restarted
-knows from its store who asked for what last. As soon as such a sender is heard again it is told how its task stands,
+A task's sender hears by STATUSTEXT how it goes on (`Progress`), over a restart too: a gateway that was restarted
+knows from its store who asked for what last. As soon as such a sender is heard again it gets the state of its task,
 and then how it goes on; what it was told of an end before, it is not told again.
 """
 
@@ -36,6 +36,7 @@ import msgspec
 import structlog
 from msgspec import Struct
 
+from appliance.background import Background
 from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import Plan, TaskRecord, TaskRequest, TaskState, encode
 from appliance.robots.executor import KeyValues
@@ -49,7 +50,7 @@ log = structlog.get_logger(__name__)
 # --- progress of tasks -----------------------------------------------------------------------------------------------
 
 MAX_FOLLOWED = 1000
-"""Tasks whose senders are told how they go on; the oldest is forgotten first."""
+"""Tasks whose senders hear how they go on; the oldest is forgotten first."""
 _LOOK_S = 1.0
 _PASSING = (RefusedError, UnreachableError, DeadlineError)
 
@@ -90,7 +91,7 @@ class Progress:
             await asyncio.gather(self._looking, return_exceptions=True)
 
     def follows(self, task: str) -> bool:
-        """Whether somebody is told how this task goes on."""
+        """Whether somebody follows this task."""
         return task in self._followed
 
     def follow(self, task: str, sender: str, reply: Reply) -> None:
@@ -266,7 +267,7 @@ class CommandServer:
         refused: counters of bad input.
         mission: returns the instruction and plan of a vehicle's mission, by the parameters of MISSION_START; None:
             none are taken here.
-        reach: finds senders of before a restart, who are told how their tasks go on.
+        reach: finds senders of before a restart, who hear how their tasks go on.
         clock: seconds of the wall clock.
     """
 
@@ -290,7 +291,7 @@ class CommandServer:
         self._cancelling: dict[str, asyncio.Task[None]] = {}
         self._last: OrderedDict[str, Asked] = OrderedDict()
         self._at_work: dict[str, _Work] = {}
-        self._keeping: set[asyncio.Task[None]] = set()
+        self._keeping = Background()
         self._progress = Progress(tasks=tasks, reach=reach, ended=self._ended)
 
     async def load(self) -> None:
@@ -311,7 +312,7 @@ class CommandServer:
         running = [*(each.running for each in self._at_work.values()), *self._cancelling.values()]
         for task in running:
             task.cancel()
-        await asyncio.gather(*running, *self._keeping, return_exceptions=True)
+        await asyncio.gather(*running, *self._keeping.tasks, return_exceptions=True)
 
     def take(self, frame: Frame, *, robot: str, asker: str = "", reply: Callable[[Message], None]) -> None:
         """Take a command that is for this gateway.
@@ -390,7 +391,7 @@ class CommandServer:
         self._answer(frame, reply, dialect.IN_PROGRESS)
         try:
             request = self._request(asked, robot=robot, submitter=asker or f"{STATION}{sender}")
-            # Kept before it is handed in: whoever repeats it after a crash here asks for the same task.
+            # Kept before it is handed in: repeated after a crash here it is the same task.
             await self._store.put(PREFIX + sender, encode(asked))
             self._progress.follow(asked.task, sender, reply)
             if self._tasks is None:
@@ -489,7 +490,7 @@ class CommandServer:
     # --- telling -----------------------------------------------------------------------------------------------
 
     def follows(self, task: str) -> bool:
-        """Whether somebody is told how this task goes on."""
+        """Whether somebody follows this task."""
         return self._progress.follows(task)
 
     def news(self, record: TaskRecord) -> None:
@@ -505,9 +506,7 @@ class CommandServer:
         last = self._last.get(sender)
         if last is not None and last.task == task:
             last.ended = True
-            keeping = asyncio.create_task(self._keep(sender, last), name=f"end of {task}")
-            self._keeping.add(keeping)
-            keeping.add_done_callback(self._keeping.discard)
+            self._keeping.start(self._keep(sender, last), f"end of {task}")
 
     async def _keep(self, sender: str, asked: Asked) -> None:
         try:

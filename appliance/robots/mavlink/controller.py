@@ -11,14 +11,14 @@ SET_POSITION_TARGET_LOCAL_NED with velocities in the body's frame (ArduPilot, "C
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import structlog
 
 from appliance.model import Pose, Site
 from appliance.model.site import to_globe, to_site
-from appliance.robots.executor import Done, Verb
+from appliance.robots.executor import Done, Terms, Verb, verb, verbs_of
 from appliance.robots.limits import breach, check_velocity
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Message, make
@@ -66,22 +66,9 @@ class VehicleController:
             raise RobotFailure("robot", f"the modes of {self.vehicle.name} are not known here")
         return modes
 
-    def verb(
-        self,
-        run: Callable[..., Awaitable[Done]],
-        *,
-        uses: tuple[str, ...] = ("base",),
-        resumable: bool = True,
-        preempts: bool = False,
-        safe: bool = False,
-    ) -> Verb:
-        """Return a verb that is refused while somebody else has the vehicle; `safe`: not while a failsafe has it."""
-
-        async def guarded(args: object) -> Done:
-            self.check_control(safe=safe)
-            return await run(args)
-
-        return Verb(run=guarded, uses=uses, resumable=resumable, preempts=preempts)
+    def verbs_of(self, *parts: object) -> dict[str, Verb]:
+        """Return the verbs that those parts of it carry out; guarded ones are refused while somebody else has it."""
+        return verbs_of(*parts, check=lambda safe: self.check_control(safe=safe), flies=self.vehicle.flies)
 
     def ready(self) -> None:
         """Raise RobotFailure while it cannot be reached."""
@@ -214,7 +201,7 @@ class VehicleController:
             raise RobotFailure(
                 "robot",
                 f"{vehicle.name} could not be told to hold: it is offline, and was {last} when it was heard last",
-                remedy="its own failsafe has it; a soft stop (`swiftbot stop`) is told when it is back",
+                remedy="its own failsafe has it; a soft stop (`swiftbot stop`) reaches it when it is back",
                 retryable=True,
             )
         if not vehicle.armed:
@@ -420,6 +407,7 @@ class ManualControl:
     def __init__(self, craft: VehicleController) -> None:
         self._craft = craft
 
+    @verb(Terms(resumable=False, preempts=True))
     async def velocity(self, args: VelocityArgs) -> Done:
         """Move for `for_s` seconds; RobotFailure where it may not, or is on the ground and flies."""
         craft, vehicle = self._craft, self._craft.vehicle

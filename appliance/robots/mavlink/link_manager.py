@@ -7,9 +7,10 @@ and no time used twice.
 """
 
 import asyncio
+import functools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import msgspec
 import structlog
@@ -17,14 +18,14 @@ from msgspec import Struct
 
 from appliance.errors import ConfigError, NotFoundError, RefusedError, SwiftbotError
 from appliance.model import encode
-from appliance.robots.api import LatencyFacts, LinkFacts, SenderFacts
+from appliance.model.robot_api import LatencyFacts, LinkFacts, MavlinkLink, SenderFacts
 from appliance.robots.executor import KeyValues
 from appliance.robots.hub import ADDED_LINKS as KEY
 from appliance.robots.mavlink.dialect import KINDS, NAMES, Codec, Frame, make
-from appliance.robots.mavlink.links import Address, Link, open_link
+from appliance.robots.mavlink.links import Address, Link, Sink, open_link
 from appliance.robots.mavlink.routing import Damper, End, RoutingTable, Rules
 from appliance.robots.mavlink.signing import Memory, Signer, read_key
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import RobotsConfig
 
 log = structlog.get_logger(__name__)
 
@@ -65,7 +66,7 @@ async def remember(links: Iterable[tuple[MavlinkLink, Link]], store: KeyValues, 
 
 MAX_LINKS = 64
 MOST_TOLD = 64
-"""Senders of a link that are told about: those heard last."""
+"""Senders of a link that are listed: those heard last."""
 
 
 class KeptLinks(Struct, frozen=True, kw_only=True):
@@ -84,7 +85,7 @@ class OpenLink(Struct, eq=False):
     added: bool
     damper: Damper
     ends: dict[Address, End] = msgspec.field(default_factory=dict[Address, End])
-    """Ends by address, so that none is made anew for each frame."""
+    """Ends by address, so that none is made for each frame."""
 
     def end(self, address: Address) -> End:
         """Return the end at an address."""
@@ -106,22 +107,24 @@ async def kept_links(store: KeyValues) -> KeptLinks:
         return KeptLinks()
 
 
+def message_names(setting: str, wanted: Collection[str]) -> frozenset[str]:
+    """Return the messages that a setting names, by name or number; ConfigError for one that is none."""
+    found: set[str] = set()
+    for text in wanted:
+        kind = KINDS.get(int(text)) if text.isascii() and text.isdecimal() else None
+        name = kind.name if kind is not None else text.upper()
+        if name not in NAMES:
+            raise ConfigError(
+                f"{setting}: {text[:60]!r} is no MAVLink message",
+                remedy="use names as on mavlink.io (ATTITUDE), or numbers",
+            )
+        found.add(name)
+    return frozenset(found)
+
+
 def rules_of(setting: MavlinkLink) -> Rules:
     """Return a link's filters, by names; ConfigError for a message that is none."""
-
-    def names(wanted: tuple[str, ...]) -> frozenset[str]:
-        found: set[str] = set()
-        for each in wanted:
-            kind = KINDS.get(int(each)) if each.isascii() and each.isdecimal() else None
-            name = kind.name if kind is not None else each.upper()
-            if name not in NAMES:
-                raise ConfigError(
-                    f"robots.mavlink {setting.remote}: {each[:60]!r} is no MAVLink message",
-                    remedy="use names as on mavlink.io (ATTITUDE), or numbers",
-                )
-            found.add(name)
-        return frozenset(found)
-
+    names = functools.partial(message_names, f"robots.mavlink {setting.remote}")
     return Rules(
         only_in=names(setting.only_in),
         not_in=names(setting.not_in),
@@ -136,11 +139,9 @@ class LinkManager:
     Args:
         config: the links to begin with, and limits.
         store: keeps what is changed, and what signed links know.
-        router: told which links there are.
-        on_frame: told each good frame, of which link and whose, on the event loop.
-        on_gone: told each link that is removed, once it is closed.
+        routing: knows the links by number.
         refused: counters of bad input by kind.
-        busy: whether no more can be taken just now.
+        keyed: whether the gateway has keys: then links that others may reach have to be signed.
     """
 
     def __init__(
@@ -148,19 +149,16 @@ class LinkManager:
         config: RobotsConfig,
         *,
         store: KeyValues,
-        router: RoutingTable,
-        on_frame: Callable[[OpenLink, Frame, Address], None],
-        on_gone: Callable[[OpenLink], None],
+        routing: RoutingTable,
         refused: dict[str, int],
-        busy: Callable[[], bool] = lambda: False,
+        keyed: bool = False,
     ) -> None:
+        self._keyed = keyed
         self._config = config
         self._store = store
-        self._router = router
-        self._on_frame = on_frame
-        self._on_gone = on_gone
+        self._routing = routing
         self._refused = refused
-        self._busy = busy
+        self._sink: Sink | None = None
         self._links: dict[int, OpenLink] = {}
         self._kept = KeptLinks()
         self._changing = asyncio.Lock()
@@ -175,12 +173,13 @@ class LinkManager:
         """Return a link by its number, None when it is closed."""
         return self._links.get(number)
 
-    async def open(self) -> None:
-        """Open all; ConfigError with the remedy when a setting of the configuration is wrong or its port taken.
+    async def open(self, sink: Sink) -> None:
+        """Open all, whose frames the sink takes; ConfigError with the remedy when a setting is wrong or a port taken.
 
         One added at run time that cannot be opened is logged and left out until the next start: the gateway must come
         up without a person.
         """
+        self._sink = sink
         self._kept = await kept_links(self._store)
         for setting in self._config.mavlink:
             if str(setting.remote) in self._kept.removed:
@@ -196,22 +195,20 @@ class LinkManager:
                 log.warning("a MAVLink link added at run time cannot be opened", reason=str(error))
 
     async def _open(self, setting: MavlinkLink, *, added: bool) -> OpenLink:
+        if self._keyed:
+            setting.check_keyed()
         rules = rules_of(setting)
         number = next(each for each in range(MAX_LINKS + 1) if each not in self._links)
         signer = await load_signer(setting, number, self._store)
+        assert self._sink is not None  # noqa: S101 - `open` comes first
         codec = Codec(self._config.system_id, self._config.component_id, signer=signer, v1=setting.mavlink1)
 
-        def receive(frame: Frame, address: Address) -> None:
-            entry = self._links.get(number)
-            if entry is not None:
-                self._on_frame(entry, frame, address)
-
-        self._router.add(number, rules)
+        self._routing.add(number, rules)
         try:
-            limit_hz, busy = self._config.sender_hz, self._busy
-            link = await open_link(setting.remote, codec, receive, self._refused, limit_hz=limit_hz, busy=busy)
+            limit_hz, refused = self._config.sender_hz, self._refused
+            link = await open_link(setting.remote, codec, self._sink, refused, number=number, limit_hz=limit_hz)
         except BaseException:
-            self._router.remove(number)
+            self._routing.remove(number)
             raise
         entry = self._links[number] = OpenLink(number, setting, link, added, Damper(self._config.message_hz))
         log.info("MAVLink link open", link=str(setting.remote), listens=setting.remote.listens, signed=bool(signer))
@@ -272,8 +269,7 @@ class LinkManager:
             await found.link.close()
             await remember([(found.setting, found.link)], self._store, last=True)
             del self._links[found.number]
-            self._router.remove(found.number)
-            self._on_gone(found)
+            self._routing.remove(found.number)
             log.info("MAVLink link removed", link=url, by=by[:120])
             return last
 
@@ -292,7 +288,7 @@ class LinkManager:
         """Keep what signed links know."""
         await remember(((each.setting, each.link) for each in self), self._store)
 
-    # --- what is told ------------------------------------------------------------------------------------------
+    # --- what is published ---------------------------------------------------------------------------------------
 
     def ask_time(self, ends: set[End]) -> list[tuple[End, bytes]]:
         """Send each end a TIMESYNC, whose answer tells the latency; returns what was sent."""
@@ -330,7 +326,7 @@ class LinkManager:
             listens=entry.setting.remote.listens,
             signed=link.codec.signer is not None,
             added=entry.added,
-            ends=tuple(sorted(_shown(end.address) for end in self._router.ends if end.link == entry.number)),
+            ends=tuple(sorted(_shown(end.address) for end in self._routing.ends if end.link == entry.number)),
             frames_in=stats.frames_in,
             frames_out=stats.frames_out,
             bytes_in=stats.bytes_in,
@@ -371,7 +367,7 @@ class LinkManager:
     def routes(self) -> dict[str, str]:
         """Where each sender was heard last."""
         found: dict[str, str] = {}
-        for (system, component), end in sorted(self._router.routes.items()):
+        for (system, component), end in sorted(self._routing.routes.items()):
             entry = self._links.get(end.link)
             if entry is not None:
                 found[f"{system}/{component}"] = f"{entry.setting.remote} {_shown(end.address)}"

@@ -22,15 +22,15 @@ import os
 import socket
 import termios
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
-from typing import Any, cast
+from collections.abc import Iterable
+from typing import Any, Protocol, cast
 
 import structlog
 from msgspec import Struct
 
 from appliance.errors import ConfigError
+from appliance.model.robot_api import Remote
 from appliance.robots.mavlink.dialect import Codec, Damage, Frame, Message, Stream
-from appliance.robots.settings import Remote
 
 Address = tuple[str, int]
 """Host and port of the other end; of a serial link its device and 0."""
@@ -217,27 +217,40 @@ class Limiter:
 _BUSY_S = 0.005
 
 
+class Sink(Protocol):
+    """Where the good frames of links go, on the event loop."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether no more can be taken just now, so that streams are not read; datagrams cannot wait."""
+        ...
+
+    def receive(self, link: int, frame: Frame, address: Address) -> None:
+        """Take a frame of the link with that number, from that address."""
+        ...
+
+
 class Link(abc.ABC):
-    """One link. `on_frame(frame, address)` runs on the event loop for each good frame.
+    """One link.
 
     Args:
         remote: where it is.
         codec: decoder and encoder of this link alone.
-        on_frame: told each good frame, and whose it is.
+        sink: takes each good frame.
         refused: counters of bad input by kind, of all links together; its own are `damaged`.
+        number: by which the sink knows the link.
         limit_hz: most frames a second from one end; 0 for no limit.
-        busy: whether no more can be taken just now, so that streams are not read; datagrams cannot wait.
     """
 
     def __init__(
         self,
         remote: Remote,
         codec: Codec,
-        on_frame: Callable[[Frame, Address], None],
+        sink: Sink,
         refused: dict[str, int] | None = None,
         *,
+        number: int = 0,
         limit_hz: float = 0.0,
-        busy: Callable[[], bool] = lambda: False,
     ) -> None:
         self.remote = remote
         self.codec = codec
@@ -246,9 +259,9 @@ class Link(abc.ABC):
         self.stats = LinkStats(self.now())
         self.problem = ""
         """Why nothing is heard just now, where that is known."""
-        self._on_frame = on_frame
+        self._sink = sink
+        self._number = number
         self._limiter = Limiter(limit_hz)
-        self._busy = busy
 
     @staticmethod
     def now() -> float:
@@ -309,16 +322,16 @@ class Link(abc.ABC):
 
     def take(self, found: Iterable[Frame | Damage], address: Address) -> int:
         """Pass on frames, count what is none; return how many pieces there were of both."""
-        pieces, stats = 0, self.stats
-        for each in found:
-            if isinstance(each, Damage):
-                if not each.counted:
-                    continue
-                self.count(each.kind)
-            else:
+        pieces, stats, receive, number = 0, self.stats, self._sink.receive, self._number
+        for piece in found:
+            if isinstance(piece, Frame):
                 stats.frames_in += 1
-                stats.bytes_in += len(each.raw)
-                self._on_frame(each, address)
+                stats.bytes_in += len(piece.raw)
+                receive(number, piece, address)
+            elif piece.counted:
+                self.count(piece.kind)
+            else:
+                continue
             pieces += 1
         return pieces
 
@@ -338,7 +351,7 @@ class Link(abc.ABC):
         if wait_s:
             self.count("slowed")
             await asyncio.sleep(wait_s)
-        while self._busy():  # noqa: ASYNC110 - what it waits for is a thread's queue, which tells nobody
+        while self._sink.busy:  # noqa: ASYNC110 - what it waits for is a thread's queue, which tells nobody
             await asyncio.sleep(_BUSY_S)
 
     def taken(self, error: OSError) -> ConfigError:
@@ -393,7 +406,7 @@ class _Datagrams(asyncio.DatagramProtocol):
 
 
 class UdpServer(Link):
-    """Listens; whoever sends is answered where it sent from."""
+    """Listens; a sender is answered where it sent from."""
 
     _transport: asyncio.DatagramTransport | None = None
     _datagrams: _Datagrams | None = None
@@ -451,7 +464,7 @@ class UdpServer(Link):
 class UdpClient(Link):
     """Sends to one address from a port of the system's choice; only that address is heard.
 
-    The socket is made anew after an error: an interface may come up later than the gateway, or change its address.
+    A new socket is made after an error: an interface may come up later than the gateway, or change its address.
     """
 
     RETRY_S = 2.0
@@ -780,7 +793,7 @@ class SerialLink(Link):
             pass
         except OSError as error:
             self.problem = str(error)
-            self._broken.set()  # the reader sees it too, and opens anew
+            self._broken.set()  # the reader sees it too, and opens it again
             self._unsent.clear()
         if self._unsent:
             loop.add_writer(self._fd, self._flush)
@@ -838,27 +851,27 @@ _KINDS: dict[tuple[str, bool], type[Link]] = {
 async def open_link(
     remote: Remote,
     codec: Codec,
-    on_frame: Callable[[Frame, Address], None],
+    sink: Sink,
     refused: dict[str, int] | None = None,
     *,
+    number: int = 0,
     limit_hz: float = 0.0,
-    busy: Callable[[], bool] = lambda: False,
 ) -> Link:
     """Open the link that a setting names.
 
     Args:
         remote: scheme, host and port, and whether to listen there or to connect.
         codec: decoder and encoder of this link alone.
-        on_frame: told each good frame and who sent it, on the event loop.
+        sink: takes each good frame.
         refused: counters of bad input by kind.
+        number: by which the sink knows the link.
         limit_hz: most frames a second from one end: more of a datagram link are dropped and counted as `flood`, of a
             stream they are read later. 0 for no limit.
-        busy: whether no more can be taken just now; streams are then read later.
 
     Raises:
         ConfigError: the port to listen on is taken or not this machine's. A link that connects does not raise: it
             tries for as long as it is open.
     """
-    link = _KINDS[remote.scheme, remote.listens](remote, codec, on_frame, refused, limit_hz=limit_hz, busy=busy)
+    link = _KINDS[remote.scheme, remote.listens](remote, codec, sink, refused, number=number, limit_hz=limit_hz)
     await link.open()
     return link

@@ -376,7 +376,7 @@ class MissionServer:
                 await self._store.delete(key)
 
     async def close(self) -> None:
-        """Stop; whoever had no answer sends again."""
+        """Stop; senders without an answer send again."""
         keeping = list(self._keeping.values())
         for task in keeping:
             task.cancel()

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import structlog
 
-from appliance.robots.executor import Done
+from appliance.robots.executor import Done, Terms, verb
 from appliance.robots.limits import check_mission, check_orbit, check_points
 from appliance.robots.mavlink import dialect, protocols
 from appliance.robots.mavlink.controller import POLL_S, Point, VehicleController
@@ -44,6 +44,7 @@ class Missions:
 
     # --- verbs -------------------------------------------------------------------------------------------------
 
+    @verb()
     async def mission(self, args: MissionArgs) -> Done:
         """Go through the steps; the same mission given again goes on where it was left."""
         craft = self._craft
@@ -56,7 +57,7 @@ class Missions:
         stations = self._stations(board)
         behind = sum(number < first for number in stations)
         if ahead := points[behind:]:
-            # From where it is now: whoever had it meanwhile may have brought it anywhere.
+            # From where it is now: a pilot who had it meanwhile may have brought it anywhere.
             here = craft.position()
             check_points(craft.site, here, ahead, flies=vehicle.flies, verb="mission", behind=behind)
         if first == 0:
@@ -80,6 +81,7 @@ class Missions:
         await craft.travel("mission", craft.modes.mission, done, left, steady=staying)
         return Done({"steps": len(args.steps), "items": len(board), "resumed_at": first} | craft.where())
 
+    @verb(Terms(flying=True))
     async def orbit(self, args: OrbitArgs) -> Done:
         """Circle round a point, then stay on the circle."""
         craft = self._craft
@@ -201,11 +203,11 @@ class Missions:
         return []
 
     def _ended(self, args: MissionArgs) -> bool:
-        """Whether a mission that ends on the ground has: it disarms there, before its last item is told as reached."""
+        """Whether a mission that ends on the ground has: it disarms there before it reports its last item."""
         return args.end != "hold" and self._craft.vehicle.flies and not self._craft.vehicle.armed
 
     async def _left_at(self, items: Sequence[Item]) -> tuple[int, Sequence[Item]]:
-        """Return the item at which this very mission was left and what is on board; 0 when it is to be begun anew."""
+        """Return the item at which this very mission was left and what is on board; 0: at the first."""
         vehicle = self._craft.vehicle
         if vehicle.mission_items < 2 or vehicle.mission_complete or vehicle.mission_at < 1 or not vehicle.armed:
             return 0, items
@@ -229,7 +231,7 @@ class Missions:
         if not vehicle.armed:
             await craft.mode(craft.modes.guided)
             await craft.arm()
-        # A vehicle that flies this very mission is told no item: it may have passed it by the time it hears of it, and
+        # A vehicle that flies this very mission gets no item: it may have passed it by the time it hears of it, and
         # would fly back and do a second time what is done there.
         flying = first > 0 and vehicle.custom_mode == craft.modes.numbers[craft.modes.mission]
         again = first > 0 and not flying and await self._begins_anew()
@@ -238,8 +240,8 @@ class Missions:
         if first == 0:
             vehicle.forget_mission()
         try:
-            # Said again right behind the mode, where entering it begins anew: whatever is done at the items before
-            # would be done twice until an answer came.
+            # Said again right behind the mode, where entering it restarts the mission: whatever is done at the items
+            # before would be done twice until an answer came.
             behind = command_long(vehicle, dialect.SET_CURRENT, float(first)) if again else None
             await craft.mode(craft.modes.mission, behind=behind)
             # ArduPilot denies a first or last item here.
@@ -253,7 +255,7 @@ class Missions:
             raise
 
     async def _begins_anew(self) -> bool:
-        """Whether entering the mode begins the mission anew (ArduPilot's MIS_RESTART); False where it is not told."""
+        """Whether entering the mode restarts the mission (ArduPilot's MIS_RESTART); False where that is not known."""
         patience = RetryPolicy(timeout_s=self._craft.patience.timeout_s, tries=_ASKED)
         try:
             return await protocols.read_parameter(self._craft.vehicle, "MIS_RESTART", patience=patience) != 0
@@ -261,7 +263,7 @@ class Missions:
             return False  # another autopilot, or a lossy link: `_stay_at` sees to it
 
     async def _stay_at(self, item: int) -> None:
-        """Say the item again where the mission was begun anew all the same.
+        """Say the item again where the mission was restarted all the same.
 
         Where it has not, nothing is said: the item may be behind already, and what is done at it would be done twice.
         """

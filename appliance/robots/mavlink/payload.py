@@ -9,7 +9,7 @@ import asyncio
 import math
 import secrets
 
-from appliance.robots.executor import Done, Verb
+from appliance.robots.executor import Done, Terms, verb
 from appliance.robots.mavlink import dialect, statustext
 from appliance.robots.mavlink.controller import VehicleController
 from appliance.robots.mavlink.dialect import Message, constant, make
@@ -48,27 +48,17 @@ _TUNE = "MFT200L16<cdefgab>cdefgab"
 
 
 class Payload:
-    """Of one craft."""
+    """Of one craft. Autopilots refuse what they do not have."""
 
     def __init__(self, craft: VehicleController) -> None:
         self._craft = craft
         self._manager: int | None = None
 
-    def verbs(self) -> dict[str, Verb]:
-        """Return what can be told to what it carries. Autopilots refuse what they do not have."""
-        return {
-            "trigger": Verb(run=self.trigger, uses=("camera",)),
-            "video": Verb(run=self.video, uses=("camera",), resumable=True),
-            "gimbal": Verb(run=self.gimbal, uses=("gimbal",), resumable=True),
-            "gripper": Verb(run=self.gripper, uses=("gripper",), resumable=True),
-            "servo": Verb(run=self.servo, uses=("servo",), resumable=True),
-            "say": Verb(run=self.say, uses=("speaker",)),
-        }
-
     # --- camera ------------------------------------------------------------------------------------------------
 
+    @verb(Terms(uses=("camera",), resumable=False, guarded=False))
     async def trigger(self, args: TriggerArgs) -> Done:
-        """Take pictures; each has a number, by which a repeated order is told from a further one."""
+        """Take pictures; each has a number, which distinguishes a repeated order from a further one."""
         in_range("trigger", "count", args.count, 1, MAX_PICTURES)
         in_range("trigger", "interval_s", args.interval_s, 0.0, 3600.0)
         images: list[dict[str, object]] = []
@@ -106,6 +96,7 @@ class Payload:
         where = {"x": round(x, 2), "y": round(y, 2), "z": round(z, 2)}
         return {"index": int(told.image_index), "file_url": url.rstrip("\0"), "position": where}
 
+    @verb(Terms(uses=("camera",), guarded=False))
     async def video(self, args: VideoArgs) -> Done:
         """Start or stop recording; confirmed by the camera's own status."""
         craft = self._craft
@@ -135,6 +126,7 @@ class Payload:
 
     # --- gimbal ------------------------------------------------------------------------------------------------
 
+    @verb(Terms(uses=("gimbal",), guarded=False))
     async def gimbal(self, args: GimbalArgs) -> Done:
         """Turn the gimbal to angles, or keep it on a point of the site.
 
@@ -214,6 +206,7 @@ class Payload:
 
     # --- gripper, servo, voice ---------------------------------------------------------------------------------
 
+    @verb(Terms(uses=("gripper",), guarded=False))
     async def gripper(self, args: GripperArgs) -> Done:
         """Grab or release."""
         in_range("gripper", "instance", args.instance, 1, 8)
@@ -222,6 +215,7 @@ class Payload:
         await command(vehicle, dialect.GRIPPER, float(args.instance), closes, patience=self._craft.patience)
         return Done({"gripper": args.action} | self._craft.where())
 
+    @verb(Terms(uses=("servo",), guarded=False))
     async def servo(self, args: ServoArgs) -> Done:
         """Set an output that the configuration leaves to the gateway: among the others are motors and rudders."""
         config = self._craft.config
@@ -237,6 +231,7 @@ class Payload:
         await command(vehicle, dialect.SERVO, float(args.output), float(args.pwm_us), patience=patience)
         return Done({"output": args.output, "pwm_us": args.pwm_us} | self._craft.where())
 
+    @verb(Terms(uses=("speaker",), resumable=False, guarded=False))
     async def say(self, args: SayArgs) -> Done:
         """Show words at the vehicle and on all ground stations, and play a tune. Nothing of it is acknowledged."""
         vehicle = self._craft.vehicle

@@ -2,7 +2,10 @@
 
 Source: MAVLink guide, "Routing": a frame for everybody goes to all other ends; a frame for a system goes where that
 system (or its component) has been heard, and nowhere when it was heard nowhere; nothing goes back to where it came
-from. Ends are (link, address): two vehicles on one listening port are two ends. A ring of routers would send a frame
+from. Ends are (link, address): two vehicles on one listening port are two ends. What a vehicle sends for everybody is
+not for other vehicles: each of N would get the telemetry of all others, N·N frames. They get the messages that are
+named as shared (`robots.vehicles_share`), all that stations and onboard computers send, and what is addressed to them.
+An end is passed over so only where nobody but other vehicles has been heard. A ring of routers would send a frame
 round for ever, so a frame that was seen just before is dropped, and a sender is believed on the end it was heard on
 last. What was learned ages, ends and senders alike.
 
@@ -13,7 +16,7 @@ wanted at such a rate, so what it passes on is cut until nearly nothing more com
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Protocol
 
 from msgspec import Struct
@@ -24,8 +27,10 @@ BROADCAST = 0
 WRAP = 128
 """So many frames of one sender later the same bytes are news: sequence numbers begin again after 256."""
 MAX_SEEN = 8192
-MAX_PLANNED = 4096
+MAX_PLANNED = 16384
 """Destinations remembered by sender and target, so that they are worked out once for each way."""
+COMPANIONS = range(191, 195)
+"""Components of onboard computers (MAV_COMP_ID_ONBOARD_COMPUTER to 4): what they send for all is for vehicles too."""
 
 
 class End(Struct, frozen=True):
@@ -98,6 +103,7 @@ class RoutingTable:
     Args:
         rules: of the links with the numbers 0, 1, ...; `add` and `remove` change them later.
         own_system: the gateway's system id: what is meant for it goes nowhere else.
+        shared: messages for everybody that vehicles get of each other, by name.
         forget_s: an end, or a sender at one, that was silent for so long is forgotten, with all that was learned of it.
         repeat_s: the same bytes within so long are a repetition, however they came.
         max_ends: most ends known at once; the longest silent is forgotten first.
@@ -109,6 +115,7 @@ class RoutingTable:
         rules: Sequence[Rules] = (),
         *,
         own_system: int,
+        shared: Collection[str] = (),
         forget_s: float = 60.0,
         repeat_s: float = 0.5,
         max_ends: int = 256,
@@ -116,6 +123,7 @@ class RoutingTable:
     ) -> None:
         self._rules = dict(enumerate(rules))
         self._own = own_system
+        self._shared = frozenset(shared)
         self._forget_s = forget_s
         self._repeat_s = repeat_s
         self._max_ends = max_ends
@@ -128,7 +136,11 @@ class RoutingTable:
         """When bytes were let through, and which frame of their sender they were."""
         self._turns: dict[tuple[int, int], int] = {}
         """Frames let through of each sender; there are 65,280."""
-        self._planned: dict[tuple[End, str, int, int], tuple[End, ...]] = {}
+        self._planned: dict[tuple[End, str, int, int, int], tuple[End, ...]] = {}
+        self._vehicles: set[int] = set()
+        """Systems of which an autopilot has been heard."""
+        self._systems: dict[End, set[int]] = {}
+        """Systems that have been heard at each end, also those that are believed to be at another one now."""
 
     def add(self, link: int, rules: Rules) -> None:
         """Know a link by its number."""
@@ -189,11 +201,15 @@ class RoutingTable:
         """Forget that these bytes came: where they came from they were not taken, and a copy by another way may be."""
         self._seen.pop(raw, None)
 
-    def hear(self, passage: Routed, source: End, now: float) -> None:
-        """Learn that a sender is at an end."""
+    def hear(self, passage: Routed, source: End, now: float, *, autopilot: bool = False) -> None:
+        """Learn that a sender is at an end, and whether this frame shows that it is a vehicle's autopilot."""
         sender = (passage.system, passage.component)
+        if autopilot and passage.system not in self._vehicles:
+            self._vehicles.add(passage.system)
+            self._planned.clear()
         known = self._routes.get(sender)
         if known is None or known[0] != source or source not in self._ends:
+            self._systems.setdefault(source, set()).add(passage.system)
             self._planned.clear()
         self._ends[source] = now
         self._ends.move_to_end(source)
@@ -208,18 +224,29 @@ class RoutingTable:
             oldest, (_, at) = next(iter(self._routes.items()))
             if now - at <= self._forget_s and len(self._routes) <= self._max_routes:
                 break
-            del self._routes[oldest]
-            self._planned.clear()
+            self._lose(oldest)
 
     def _forget(self, end: End) -> None:
         del self._ends[end]
+        del self._systems[end]
         for sender in [sender for sender, (where, _) in self._routes.items() if where == end]:
-            del self._routes[sender]
+            self._lose(sender)
+        self._planned.clear()
+
+    def _lose(self, sender: tuple[int, int]) -> None:
+        """Forget where a sender is; a system of which nobody is left is no vehicle any more."""
+        del self._routes[sender]
+        if all(system != sender[0] for system, _ in self._routes):
+            self._vehicles.discard(sender[0])
+            for systems in self._systems.values():
+                systems.discard(sender[0])
         self._planned.clear()
 
     def destinations(self, passage: Routed, source: End) -> tuple[End, ...]:
         """Return the ends a frame heard at `source` goes on to."""
-        way = (source, passage.name, passage.target_system, passage.target_component)
+        # Whose telemetry it is decides who does not get it; of all others only the way does.
+        of_vehicle = passage.system if self._is_telemetry(passage) else BROADCAST
+        way = (source, passage.name, passage.target_system, passage.target_component, of_vehicle)
         planned = self._planned.get(way)
         if planned is None:
             if len(self._planned) >= MAX_PLANNED:
@@ -233,6 +260,8 @@ class RoutingTable:
             return ()
         if passage.target_system == BROADCAST:
             found = set(self._ends)
+            if self._is_telemetry(passage):
+                found -= self._only_vehicles(besides=passage.system)
         else:
             found = self._where(passage.target_system, passage.target_component)
         return tuple(
@@ -241,6 +270,22 @@ class RoutingTable:
                 key=lambda end: (end.link, end.address),
             )
         )
+
+    def _is_telemetry(self, passage: Routed) -> bool:
+        """Whether a frame is a vehicle's own word to everybody, which is not for other vehicles."""
+        return (
+            passage.target_system == BROADCAST
+            and passage.system in self._vehicles
+            and passage.component not in COMPANIONS
+            and passage.name not in self._shared
+        )
+
+    def _only_vehicles(self, *, besides: int) -> set[End]:
+        """Ends where nobody but other vehicles has been heard: no station, no component of the system itself.
+
+        A station with two links has one where it is not believed to be just now: it gets telemetry there all the same.
+        """
+        return {end for end, systems in self._systems.items() if systems <= self._vehicles - {besides}}
 
     def _where(self, system: int, component: int) -> set[End]:
         """Ends of a component; of its whole system where the component is not meant, or was never heard."""
@@ -297,10 +342,11 @@ class Damper:
         self.damped: dict[Kind, None] = {}
         """What is being damped."""
 
-    def passes(self, kind: Kind, now: float) -> bool:
+    def passes(self, system: int, component: int, name: str, now: float) -> bool:
         """Count a frame; whether it may go on."""
-        if not self._per_s or kind[2] in BULK:
+        if not self._per_s or name in BULK:
             return True
+        kind = (system, component, name)
         flow = self._flows.get(kind)
         if flow is None:
             flow = self._flows[kind] = _Flow(self._per_s * BURST_S, now)

@@ -1,8 +1,8 @@
 """STATUSTEXT, both ways: what people at ground stations read, and what a vehicle says in words.
 
 A text of more than 50 characters goes and comes in parts with a common `id` (MAVLink guide, STATUSTEXT); parts can be
-lost, so what has arrived is told after a while with a mark where something is missing. What a vehicle said may explain
-why it refused (`Texts`: pure, the clock passed in).
+lost, so what has arrived is passed on after a while with a mark where something is missing. What a vehicle said may
+explain why it refused (`Texts`: pure, the clock passed in).
 """
 
 import secrets

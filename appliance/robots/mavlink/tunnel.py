@@ -191,7 +191,7 @@ class Channel:
         self._heard_at = float("-inf")
         self._refusals: list[bytes] = []
         self.failed: dict[int, str] = {}
-        """Messages that were not delivered, and why; whoever sent them takes them out."""
+        """Messages that were not delivered, and why; their sender takes them out."""
         self.malformed = 0
         """Payloads that were none of this protocol, or contradicted others."""
 

@@ -18,7 +18,6 @@ and back (`to`: the op that is answered):
                                                             told as one
 """
 
-import asyncio
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable
@@ -28,6 +27,7 @@ import msgspec
 import structlog
 from msgspec import Meta, Struct, field
 
+from appliance.background import Background
 from appliance.errors import DeadlineError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import TaskRecord, TaskRequest, encode
 from appliance.robots.mavlink import dialect
@@ -43,9 +43,9 @@ MAX_SENDERS = 64
 MAX_AT_WORK = 16
 """Messages being carried out at once."""
 MAX_FOLLOWED = 1000
-"""Tasks whose senders are told how they go on; the one asked for longest ago is forgotten first."""
+"""Tasks whose senders hear how they go on; the one asked for longest ago is forgotten first."""
 MOST_RESULTS = 8 * 1024
-"""Bytes of results that are told; what is larger is looked up by the task's id."""
+"""Bytes of results that are sent; what is larger is looked up by the task's id."""
 MOST_WORDS = 700
 """Characters of a reason: two of them fit into a message however they are written in JSON."""
 MOST_NEWS = 256
@@ -63,7 +63,7 @@ class TunnelMessage(Struct, frozen=True, kw_only=True):
 
 
 class Answer(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What it is told."""
+    """What it gets."""
 
     op: Literal["accepted", "rejected", "news"]
     id: str
@@ -133,14 +133,12 @@ class TunnelServer:
         self._clock = clock
         self._senders: OrderedDict[tuple[int, int], _Sender] = OrderedDict()
         self._followed: OrderedDict[str, dict[tuple[int, int], bytes]] = OrderedDict()
-        """Task -> who is told, and what they were told last."""
-        self._at_work: set[asyncio.Task[None]] = set()
+        """Task -> who follows it, and what they got last."""
+        self._at_work = Background()
 
     async def close(self) -> None:
-        """Stop; whoever had no answer sends again."""
-        for task in self._at_work:
-            task.cancel()
-        await asyncio.gather(*self._at_work, return_exceptions=True)
+        """Stop; senders without an answer send again."""
+        await self._at_work.close()
 
     def take(self, frame: Frame, *, asker: str = "", reply: Callable[[Message], None]) -> None:
         """Take a TUNNEL frame of this protocol that is for this gateway; arguments as `CommandServer.take`."""
@@ -183,7 +181,7 @@ class TunnelServer:
                 log.info("an answer over MAVLink was not delivered", to=sender.name, reason=reason)
 
     def follows(self, task: str) -> bool:
-        """Whether somebody is told how this task goes on."""
+        """Whether somebody follows this task."""
         return task in self._followed
 
     def news(self, record: TaskRecord) -> None:
@@ -213,12 +211,10 @@ class TunnelServer:
                 sender, Answer(op="rejected", id="", code="payload", message=f"not understood: {error}"[:MOST_WORDS])
             )
             return
-        if len(self._at_work) >= MAX_AT_WORK:
+        if self._at_work.count >= MAX_AT_WORK:
             self._reject(sender, letter, RefusedError("too many messages are being carried out"))
             return
-        work = asyncio.create_task(self._carry_out(sender, letter), name=f"MAVLink letter of {sender.name}")
-        self._at_work.add(work)
-        work.add_done_callback(self._at_work.discard)
+        self._at_work.start(self._carry_out(sender, letter), f"MAVLink letter of {sender.name}")
 
     async def _carry_out(self, sender: _Sender, letter: TunnelMessage) -> None:
         new = self._follow(letter.id, sender)

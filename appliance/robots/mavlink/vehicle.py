@@ -19,16 +19,16 @@ Control authority: the gateway, a person at the vehicle, or its own failsafes. A
 pilot has taken the sticks fights with them. So it notices: a mode that it did not order, sticks moved over the gateway
 (RC_CHANNELS_OVERRIDE, MANUAL_CONTROL), a failsafe in force. The vehicle is then *seized*: the command in progress fails
 with the reason, further ones are refused, and nothing that the gateway does of its own accord changes the mode. It is
-given back by whoever took it (the mode that the gateway had ordered, or the guided mode, is chosen again; the motors
-are off; the failsafe is over), or taken back by an operator (`release`). A gateway that has just started, or a vehicle
-that has just been armed, has no order yet that a mode could be measured by; but a gateway never orders a mode in which
-sticks move a vehicle, so whoever chose that one has it. On the ground with the motors off nothing is seized: there a
-mode is a setting.
+given back by the one who took it (the mode that the gateway had ordered, or the guided mode, is chosen again; the
+motors are off; the failsafe is over), or taken back by an operator (`release`). A gateway that has just started, or a
+vehicle that has just been armed, has no order yet that a mode could be measured by; but a gateway never orders a mode
+in which sticks move a vehicle, so the one who chose it has the vehicle. On the ground with the motors off nothing is
+seized: there a mode is a setting.
 """
 
 import asyncio
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Modes(Struct, frozen=True, kw_only=True):
 
     numbers: dict[str, int]
     guided: str = "GUIDED"
-    """Goes where it is told, and stays where it is when it has been told nothing."""
+    """Goes where it is sent, and stays where it is without an order."""
     mission: str = "AUTO"
     home: str = "RTL"
     land: str = ""
@@ -398,7 +398,7 @@ def _failsafe(words: str, mode: str) -> str:
 _KEPT = 64
 """Reports: six seconds at 10 Hz, far more than passes between two looks."""
 _CLOCK_MS = 2**32
-"""`time_boot_ms` has 32 bits and begins anew after 49.7 days."""
+"""`time_boot_ms` has 32 bits and wraps after 49.7 days."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -510,18 +510,20 @@ class Vehicle:
         *,
         site: Site,
         send: Callable[[Message], None],
+        announce: Callable[[Message], None] | None = None,
         own: int = 0,
-        implausible: Callable[[str], None] = lambda _: None,
+        refused: dict[str, int] | None = None,
     ) -> None:
         self.name = name
-        self._implausible = implausible
-        """Called with the name of each field whose value cannot be."""
+        self._refused: dict[str, int] = {} if refused is None else refused
+        self.implausible = Counter[str]()
+        """How often a field's value could not be, by name."""
         self.own = own
-        """System id that the gateway speaks as, so that answers to others are told from those to it; 0: not told."""
+        """System id that the gateway speaks as, to know answers to it from those to others; 0: not known."""
         self.site = site
         self.send = send
-        self.announce: Callable[[Message], None] = send
-        """Puts a message on all links, for whoever listens: ground stations show STATUSTEXTs."""
+        self.announce = announce or send
+        """Puts a message on all links, for all who listen: ground stations show STATUSTEXTs."""
         self.system = 0
         self.component = 0
         self.kind = 0
@@ -673,7 +675,8 @@ class Vehicle:
     def _fits(self, field: str, fits: bool) -> bool:
         """Return whether a value can be; one that cannot is counted, and what was known before stays."""
         if not fits:
-            self._implausible(field)
+            self.implausible[field] += 1
+            self._refused["implausible"] = self._refused.get("implausible", 0) + 1
         return fits
 
     def _said(self, said: Said) -> None:

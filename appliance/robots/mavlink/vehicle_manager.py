@@ -10,26 +10,23 @@ what.
 """
 
 import asyncio
-import contextlib
 from collections import Counter
 from collections.abc import Callable
 
 import structlog
 
-from appliance.errors import SwiftbotError
-from appliance.model import Failure, RobotCommand, Site, encode
+from appliance.background import Background
+from appliance.model import Failure, RobotCommand, Site, keyspace
 from appliance.plane.session import Closer, Session
-from appliance.robots.api import LinkList
 from appliance.robots.executor import CommandExecutor, IdempotencyLog, KeyValues
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.command_dispatcher import CommandDispatcher
 from appliance.robots.mavlink.dialect import Frame, Message, make
-from appliance.robots.mavlink.frame_router import FrameRouter
-from appliance.robots.mavlink.link_manager import REMEMBER_S, LinkManager, OpenLink
-from appliance.robots.mavlink.routing import End
+from appliance.robots.mavlink.frame_router import FrameSender, FrameTap
+from appliance.robots.mavlink.link_manager import LinkManager
+from appliance.robots.mavlink.routing import End, RoutingTable
 from appliance.robots.mavlink.vehicle import OVERRIDES, Vehicle, is_autopilot, moved
 from appliance.robots.settings import RobotsConfig
-from appliance.robots.task_listener import Tasks
 
 STREAMS_HZ = {
     "GLOBAL_POSITION_INT": 5.0,
@@ -76,7 +73,6 @@ def ask_streams(vehicle: Vehicle) -> None:
 
 log = structlog.get_logger(__name__)
 
-_TICK_S = 0.05
 _OFFLINE_INFO_S = 5.0
 """How often the roster is reminded of a vehicle that is offline."""
 
@@ -96,7 +92,21 @@ class _Attached:
 
 
 class VehicleManager:
-    """All MAVLink vehicles of one gateway. `attached` names those heard so far; made on the event loop."""
+    """All MAVLink vehicles of one gateway: an endpoint. `attached` names those heard so far; made on the event loop.
+
+    Args:
+        config: the robots room's settings.
+        session: where robots are put, and their commands are heard.
+        store: keeps what must outlive a restart.
+        gateway: this one's name.
+        site: where vehicles are.
+        refused: counters of bad input.
+        gate: says why a robot may not be given a command just now.
+        links: whose settings name vehicles.
+        routing: what was seen of frames.
+        sender: the way out.
+        tap: records frames by vehicle.
+    """
 
     def __init__(
         self,
@@ -107,8 +117,11 @@ class VehicleManager:
         gateway: str,
         site: Site,
         refused: dict[str, int],
-        tasks: Tasks | None = None,
-        gate: Callable[[str, RobotCommand], str] = lambda _, __: "",
+        gate: Callable[[str, RobotCommand], str],
+        links: LinkManager,
+        routing: RoutingTable,
+        sender: FrameSender,
+        tap: FrameTap,
     ) -> None:
         self._config = config
         self._gate = gate
@@ -117,6 +130,10 @@ class VehicleManager:
         self._gateway = gateway
         self._site = site
         self.refused = refused
+        self._links = links
+        self._routing = routing
+        self._sender = sender
+        self._tap = tap
         self._vehicles: dict[str, _Attached] = {}
         self._early: Counter[tuple[int, int]] = Counter()
         """Frames by system before its heartbeat; there are 255 systems a link."""
@@ -125,137 +142,87 @@ class VehicleManager:
         """Link and system of ground stations and the like."""
         self._turned_away: set[tuple[int, int, int]] = set()
         """Link, system and component of autopilots that may not be robots here."""
-        self._names: dict[End, tuple[str, ...]] = {}
-        """Vehicles at ends, worked out when first asked for."""
-        self._switch = FrameRouter(
-            config,
-            session=session,
-            store=store,
-            gateway=gateway,
-            site=site,
-            refused=refused,
-            tasks=tasks,
-            on_frame=self._receive,
-            on_gone=self._link_gone,
-            vehicles_of=self._vehicles_of,
-            names_at=self._names_at,
-            name_of=self._name_of,
-        )
         self._others: set[str] = set()
         self._watch: Closer | None = None
-        self._ticking: asyncio.Task[None] | None = None
-        self._attaching: set[asyncio.Task[None]] = set()
+        self._attaching = Background()
+        self._beat_at = self._time_at = 0.0
 
     @property
     def attached(self) -> tuple[str, ...]:
         """Names of the MAVLink vehicles heard since start, online or not."""
         return tuple(sorted(self._vehicles))
 
-    @property
-    def links(self) -> LinkManager:
-        """The links, which may come and go at run time."""
-        return self._switch.links
-
-    def link_list(self) -> LinkList:
-        """All links, what went over them, and where each sender is."""
-        return self._switch.link_list()
-
-    async def start(self) -> None:
-        """Bind the ports and begin; ConfigError with the remedy when a port is taken."""
-        try:
-            await self._switch.open()
-        except SwiftbotError:
-            await self.stop()
-            raise
-        self._watch = self._session.watch_alive(self._session.keys.robot_alive(), self._robot_seen)
-        self._ticking = asyncio.create_task(self._tick(), name="robot hub")
+    def start(self) -> None:
+        """Begin to look for other robots, whose names are taken."""
+        self._watch = self._session.watch_alive(self._session.keys(keyspace.ROBOT_ALIVE), self._robot_seen)
 
     async def stop(self) -> None:
-        """End commands (they are resumed by the next process), take back what was declared, close the ports."""
-        for task in (self._ticking, *self._attaching):
-            if task is not None:
-                task.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await task
-        self._ticking = None
-        await self._switch.quiet()
+        """End commands (they are resumed by the next process), take back what was declared."""
+        await self._attaching.close()
         for each in self._vehicles.values():
-            await each.desk.close()
-            for closer in (each.queryable, each.token):
-                if closer is not None:
-                    closer.close()
-            if each.vehicle.online:
-                each.vehicle.online = False
+            online = each.vehicle.online
+            await self._end(each)
+            if online:
                 self._tell(each, "its gateway is stopping")
         self._vehicles.clear()
         self._by_source.clear()
-        self._names.clear()
-        await self.links.close()
+        self._name_ends()
         if self._watch is not None:
             self._watch.close()
             self._watch = None
 
     # --- frames ------------------------------------------------------------------------------------------------
 
-    def _receive(self, entry: OpenLink, frame: Frame, source: End, now: float) -> None:
-        each = self._by_source.get((entry.number, frame.system))
+    def accept(self, frame: Frame, source: End, now: float) -> bool:
+        """Take a frame in as its vehicle's, or as a guest's; False for a sender that is not believed."""
+        each = self._by_source.get((source.link, frame.system))
         if frame.name in OVERRIDES and self._config.route:
             self._watch_sticks(frame, now)
-        if each is None and self._is_guest(entry, frame):
-            self._switch.record(source, "", "rx", frame.raw)
-            self._switch.hand_on(entry, frame, source, None, now)
-            return
         if each is None:
-            each = self._welcome(entry, frame, source)
-            sender = (entry.number, frame.system, frame.component)
-            if each is not None:
-                self._turned_away.discard(sender)
-            elif is_autopilot(frame):
-                self._turned_away.add(sender)
+            if self._is_guest(frame, source):
+                return True
+            each = self._welcome(frame, source)
+            sender = (source.link, frame.system, frame.component)
             if each is None:
-                self._turn_away(frame, source)
-                return
-        if source != each.end:
-            if not is_autopilot(frame) and frame.component != each.vehicle.component:
-                # A camera, a companion computer or a station with its system id and an address of its own.
-                self._switch.record(source, "", "rx", frame.raw)
-                self._switch.hand_on(entry, frame, source, None, now)
-                return
-            if each.vehicle.online:
-                self._count("address_conflict")
-                self._turn_away(frame, source)
-                return
-            each.end = source  # restarted, or back over another way
-            self._names.clear()
+                if is_autopilot(frame):
+                    self._turned_away.add(sender)
+                return self._turn_away(frame, source)
+            self._turned_away.discard(sender)
         vehicle = each.vehicle
+        if source != each.end:
+            if not is_autopilot(frame) and frame.component != vehicle.component:
+                return True  # a camera, companion computer or station with its system id and an address of its own
+            if vehicle.online:
+                self._count("address_conflict")
+                return self._turn_away(frame, source)
+            each.end = source  # restarted, or back over another way
+            self._name_ends()
         if vehicle.hear(frame, now):
             each.tell = True
-        self._switch.record(source, vehicle.name, "rx", frame.raw)
-        self._see(each, now)
-        self._switch.hand_on(entry, frame, source, vehicle, now)
+        if not vehicle.online:
+            self._see(each, now)
+        return True
 
-    def _turn_away(self, frame: Frame, source: End) -> None:
-        """Record a frame that is not taken. A copy of it may come by the way that its sender is known by."""
-        self._switch.router.unsee(frame.raw)
-        self._switch.record(source, "", "rx", frame.raw)
+    def _turn_away(self, frame: Frame, source: End) -> bool:
+        """Record a frame that goes no further. A copy of it may come by the way that its sender is known by."""
+        self._routing.unsee(frame.raw)
+        self._tap.record(source, "", "rx", frame.raw)
+        return False
 
-    def _vehicles_of(self, system: int) -> list[Vehicle]:
+    def at(self, end: End, system: int) -> Vehicle | None:
+        """Return the vehicle of a system id that is at an end."""
+        each = self._by_source.get((end.link, system))
+        return each.vehicle if each is not None and each.end == end else None
+
+    def of_system(self, system: int) -> list[Vehicle]:
+        """Return the vehicles of a system id, on all links."""
         return [each.vehicle for each in self._vehicles.values() if each.vehicle.system == system]
 
-    def _names_at(self, end: End) -> tuple[str, ...]:
-        found = self._names.get(end)
-        if found is None:
-            if len(self._names) > 4096:
-                self._names.clear()
-            found = tuple(each.vehicle.name for each in self._by_source.values() if each.end == end)
-            self._names[end] = found
-        return found
+    def _name_ends(self) -> None:
+        """Have frames recorded by the names of the vehicles that are at their ends now."""
+        self._tap.know({(each.end, system): each.vehicle.name for (_, system), each in self._by_source.items()})
 
-    def _name_of(self, frame: Frame, source: End) -> str:
-        each = self._by_source.get((source.link, frame.system))
-        return each.vehicle.name if each is not None and each.end == source else ""
-
-    def _is_guest(self, entry: OpenLink, frame: Frame) -> bool:
+    def _is_guest(self, frame: Frame, source: End) -> bool:
         """Whether the sender is no vehicle but may speak to ours: a ground station, or another onboard computer.
 
         Any frame tells that it is there: some stations never beat. A vehicle whose first heartbeat has not come yet is
@@ -263,7 +230,7 @@ class VehicleManager:
         """
         if not self._config.route or frame.system == self._config.system_id:
             return False
-        guest, sender = (entry.number, frame.system), (entry.number, frame.system, frame.component)
+        guest, sender = (source.link, frame.system), (source.link, frame.system, frame.component)
         if is_autopilot(frame):
             self._guests.discard(guest)
             return False
@@ -271,7 +238,8 @@ class VehicleManager:
             return False
         if guest not in self._guests:
             self._guests.add(guest)
-            log.info("MAVLink guest", link=str(entry.setting.remote), system=frame.system)
+            entry = self._links.get(source.link)
+            log.info("MAVLink guest", link="" if entry is None else str(entry.setting.remote), system=frame.system)
         return True
 
     def _is_address_of_ours(self, frame: Frame) -> bool:
@@ -282,16 +250,15 @@ class VehicleManager:
 
     def _watch_sticks(self, frame: Frame, now: float) -> None:
         """Notice a person who takes a vehicle over the gateway."""
-        if frame.name in OVERRIDES:
-            for each in self._vehicles.values():
-                target = frame.message.target if frame.name == "MANUAL_CONTROL" else frame.message.target_system
-                if each.vehicle.system == target:
-                    each.tell |= each.vehicle.control.sticks(frame.system, moved(frame.name, frame.message), now)
+        target = frame.message.target if frame.name == "MANUAL_CONTROL" else frame.message.target_system
+        for each in self._vehicles.values():
+            if each.vehicle.system == target:
+                each.tell |= each.vehicle.control.sticks(frame.system, moved(frame.name, frame.message), now)
 
-    def _welcome(self, entry: OpenLink, frame: Frame, source: End) -> _Attached | None:
+    def _welcome(self, frame: Frame, source: End) -> _Attached | None:
         """Make a robot of a new system if its frame is an autopilot's heartbeat and it may have a name."""
-        index = entry.number
-        name = entry.setting.name_of(frame.system)
+        index, entry = source.link, self._links.get(source.link)
+        name = None if entry is None else entry.setting.name_of(frame.system)
         known = sum(heard == index for heard, _ in self._by_source)
         if frame.system == self._config.system_id or name is None or known >= self._config.max_vehicles:
             self._count("unknown_system")
@@ -301,7 +268,7 @@ class VehicleManager:
             self._early[index, frame.system] += 1
             return None
         same = self._vehicles.get(name)
-        if same is not None and self._may_be_back(same, entry, frame):
+        if same is not None and self._may_be_back(same, frame, source):
             return self._take_back(same, index)
         if same is not None or name in self._others:
             self._count("name_conflict")
@@ -311,22 +278,23 @@ class VehicleManager:
         if early := self._early.pop((index, frame.system), 0):
             self.refused["unknown_system"] -= early
         each = self._attach(name, source)
-        self._names.clear()
         self._by_source[index, frame.system] = each
+        self._name_ends()
         return each
 
-    def _may_be_back(self, each: _Attached, entry: OpenLink, frame: Frame) -> bool:
+    def _may_be_back(self, each: _Attached, frame: Frame, source: End) -> bool:
         """Whether a silent vehicle may be followed to another link: not from a signed one to one without a key."""
         if each.vehicle.online or each.vehicle.system != frame.system:
             return False
-        old = self.links.get(each.end.link)
-        return entry.link.codec.signer is not None or old is None or old.link.codec.signer is None
+        old, new = self._links.get(each.end.link), self._links.get(source.link)
+        return old is None or old.link.codec.signer is None or (new is not None and new.link.codec.signer is not None)
 
     def _take_back(self, each: _Attached, link: int) -> _Attached:
         """Know a vehicle by another link, which it is heard on while it is silent on the one that it was known by."""
         for key in [key for key, other in self._by_source.items() if other is each]:
             del self._by_source[key]
         self._by_source[link, each.vehicle.system] = each
+        self._name_ends()
         log.info("vehicle is back over another link", robot=each.vehicle.name, link=link)
         return each
 
@@ -337,10 +305,10 @@ class VehicleManager:
             name,
             site=self._site,
             send=lambda message: self._send(name, message),
+            announce=lambda message: self._announce(name, message),
             own=own,
-            implausible=lambda _: self._count("implausible"),
+            refused=self.refused,
         )
-        vehicle.announce = lambda message: self._announce(name, message)
         helm = CommandDispatcher(vehicle, site=self._site, config=self._config)
         ledger = IdempotencyLog(name, self._store, limit=self._config.ledger)
         desk = CommandExecutor(
@@ -359,38 +327,38 @@ class VehicleManager:
         async def serve() -> None:
             await ledger.load()
             desk.verbs = helm.verbs()  # its heartbeat has told by now what it is: it can be commanded at once
-            each.queryable = self._session.serve(self._session.keys.command(name), desk.handle)
+            each.queryable = self._session.serve(
+                self._session.keys(keyspace.COMMAND, name), desk.handle, signers=keyspace.COMMAND.asks
+            )
             self._see(each, asyncio.get_running_loop().time())
             log.info("vehicle attached", robot=name, address=source.address)
 
-        task = asyncio.create_task(serve(), name=f"attach {name}")
-        self._attaching.add(task)
-        task.add_done_callback(self._attaching.discard)
+        self._attaching.start(serve(), f"attach {name}")
         return each
 
     def _send(self, name: str, message: Message) -> None:
         each = self._vehicles.get(name)
         if each is not None:
-            self._switch.send(each.end, name, message)
+            self._sender.send(each.end, message, vehicle=name)
 
-    def _link_gone(self, entry: OpenLink) -> None:
+    def let_go_of(self, link: int) -> None:
         """Let the vehicles of a link that was removed go: they may come back over another."""
-        self._guests = {(number, system) for number, system in self._guests if number != entry.number}
-        self._turned_away = {each for each in self._turned_away if each[0] != entry.number}
-        for number, system in [source for source in self._early if source[0] == entry.number]:
-            del self._early[number, system]
-        for (number, system), each in list(self._by_source.items()):
-            if number == entry.number:
-                del self._by_source[number, system]
+        self._guests = {guest for guest in self._guests if guest[0] != link}
+        self._turned_away = {sender for sender in self._turned_away if sender[0] != link}
+        for source in [source for source in self._early if source[0] == link]:
+            del self._early[source]
+        for source, each in list(self._by_source.items()):
+            if source[0] == link:
+                del self._by_source[source]
                 self._vehicles.pop(each.vehicle.name, None)
-                task = asyncio.create_task(self._let_go(each), name=f"detach {each.vehicle.name}")
-                self._attaching.add(task)
-                task.add_done_callback(self._attaching.discard)
-        self._names.clear()
+                self._attaching.start(self._let_go(each), f"detach {each.vehicle.name}")
+        self._name_ends()
 
     async def _let_go(self, each: _Attached) -> None:
         await self._end(each)
         self._tell(each, "its link was removed")
+        if each.vehicle.name not in self._vehicles:
+            self._tap.forget(each.vehicle.name)
         log.info("vehicle let go", robot=each.vehicle.name)
 
     async def _end(self, each: _Attached) -> None:
@@ -410,17 +378,18 @@ class VehicleManager:
         each = self._vehicles.pop(name, None)
         if each is not None:
             self._by_source = {source: one for source, one in self._by_source.items() if one is not each}
-            self._names.clear()
+            self._name_ends()
             await self._end(each)
+            self._tap.forget(name)
 
     def _announce(self, name: str, message: Message) -> None:
-        """Send a message to a vehicle and to whoever else listens: ground stations, other routers."""
+        """Send a message to a vehicle and all others that listen: ground stations, other routers."""
         each = self._vehicles.get(name)
         if each is None:
             return
         each.vehicle.send(message)
         vehicles = {attached.end for attached in self._by_source.values()}
-        self._switch.announce(message, vehicles, system=each.vehicle.system)
+        self._sender.announce(message, vehicles, system=each.vehicle.system)
 
     # --- presence ----------------------------------------------------------------------------------------------
 
@@ -431,7 +400,7 @@ class VehicleManager:
             return
         each.vehicle.online = True
         each.tell = True
-        each.token = self._session.declare_alive(self._session.keys.robot_alive(each.vehicle.name))
+        each.token = self._session.declare_alive(self._session.keys(keyspace.ROBOT_ALIVE, each.vehicle.name))
         ask_streams(each.vehicle)
         log.info("vehicle online", robot=each.vehicle.name)
 
@@ -453,36 +422,26 @@ class VehicleManager:
         )
 
     def _robot_seen(self, key: str, alive: bool) -> None:
-        name = key.split("/")[-2]
+        (name,) = keyspace.ROBOT_ALIVE.names(key)
         if not alive:
             self._others.discard(name)
         elif name not in self._vehicles:
             self._others.add(name)
 
-    async def _tick(self) -> None:
-        """Send heartbeats, notice lost ones, tell the roster."""
-        loop = asyncio.get_running_loop()
-        beat_at, time_at, remember_at = 0.0, 0.0, loop.time() + REMEMBER_S
-        while True:
-            now = loop.time()
-            if now >= remember_at:
-                remember_at = now + REMEMBER_S
-                with contextlib.suppress(SwiftbotError):  # a disk that is full now may not be so the next time
-                    await self.links.remember()
-            if now >= beat_at:
-                beat_at = now + self._config.heartbeat_s
-                self._beat()
-            for each in list(self._vehicles.values()):
-                if each.vehicle.online and now - each.vehicle.heard_at > self._config.heartbeat_lost_s:
-                    await self._lost(each)
-                interval = 1.0 / self._config.state_hz if each.vehicle.online else _OFFLINE_INFO_S
-                if each.queryable is not None and (each.tell or now - each.told_at >= interval):
-                    self._tell(each)
-            if self._config.timesync_s and now >= time_at:
-                time_at = now + self._config.timesync_s
-                self._switch.ask_time({each.end for each in self._vehicles.values() if each.vehicle.online})
-            self._switch.tick(now)
-            await asyncio.sleep(_TICK_S)
+    async def tick(self, now: float) -> None:
+        """Send heartbeats, notice lost ones, put the roster; to be called some twenty times a second."""
+        if now >= self._beat_at:
+            self._beat_at = now + self._config.heartbeat_s
+            self._beat()
+        for each in list(self._vehicles.values()):
+            if each.vehicle.online and now - each.vehicle.heard_at > self._config.heartbeat_lost_s:
+                await self._lost(each)
+            interval = 1.0 / self._config.state_hz if each.vehicle.online else _OFFLINE_INFO_S
+            if each.queryable is not None and (each.tell or now - each.told_at >= interval):
+                self._tell(each)
+        if self._config.timesync_s and now >= self._time_at:
+            self._time_at = now + self._config.timesync_s
+            self._sender.ask_time({each.end for each in self._vehicles.values() if each.vehicle.online})
 
     def _beat(self) -> None:
         """Tell every vehicle, and every other end that may not have been heard yet, that the gateway is there."""
@@ -491,7 +450,7 @@ class VehicleManager:
         for each in self._by_source.values():
             each.vehicle.send(beat)
             reached.add(each.end)
-        self._switch.greet(beat, reached)
+        self._sender.greet(beat, reached)
 
     def _tell(self, each: _Attached, note: str = "") -> None:
         """Put the roster entry; the verbs follow from what the last heartbeat said it is."""
@@ -508,7 +467,7 @@ class VehicleManager:
             note = ", ".join(each.desk.busy)
         verbs = (*each.desk.verbs, "stop") if each.vehicle.commandable else tuple(each.desk.verbs)
         info = each.vehicle.info(self._gateway, verbs, note)
-        self._session.put(self._session.keys.robot(each.vehicle.name), encode(info))
+        self._session.publish(keyspace.ROBOT, info, each.vehicle.name)
 
     def _count(self, what: str) -> None:
         self.refused[what] = self.refused.get(what, 0) + 1

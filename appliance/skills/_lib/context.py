@@ -16,6 +16,10 @@ class Surroundings(Protocol):
         """Return the folder of a named volume; raises Fail when it is not mounted."""
         ...
 
+    def host_folder(self, name: str) -> Path:
+        """Return a folder of the gateway's machine; raises Fail when it is not mounted."""
+        ...
+
     def map(self, path: str | Path) -> mmap.mmap:
         """Return a file's bytes without reading them."""
         ...
@@ -35,9 +39,10 @@ class Context(Surroundings, Protocol):
     resume: dict[str, Any] | None
     preloaded: Any
     scratch: Path
+    cache: Path
 
     def CallError(self, code: str, message: str, remedy: str = "", retryable: bool = False) -> Exception:  # noqa: N802
-        """Make the exception that ends the run with that reason and an error's code, by which its fault is told."""
+        """Make the exception that ends the run with that reason and an error's code, which says whose fault it is."""
         ...
 
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:

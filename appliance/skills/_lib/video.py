@@ -1,10 +1,22 @@
-"""Runs ffmpeg, which image `vision` has, with its errors turned into words."""
+"""Runs ffmpeg, which image `vision` has, with its errors turned into words.
+
+What comes from elsewhere is opened as a file of a known format and as nothing else: a playlist or a description of a
+session that is handed on as a video would have ffmpeg open what it names.
+"""
 
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
 from .context import Context
+
+FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,flv,asf,ogg,wav,w64,flac,mp3,aac,aiff,au,caf,amr,ac3"
+"""Formats of videos and recordings that are read, as ffmpeg names them; none of them refers to other files."""
+
+
+def opened(path: str | Path) -> list[str | Path]:
+    """Return the arguments with which ffmpeg reads a file that comes from elsewhere."""
+    return ["-protocol_whitelist", "file", "-format_whitelist", FORMATS, "-i", path]
 
 
 def ffmpeg(ctx: Context, arguments: Sequence[str | Path], *, what: str, timeout_s: float = 240.0) -> None:

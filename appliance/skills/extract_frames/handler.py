@@ -4,7 +4,7 @@ from typing import Any
 
 from _lib import params, pictures
 from _lib.context import Context
-from _lib.video import ffmpeg
+from _lib.video import ffmpeg, opened
 
 USUAL_FPS = 1.0
 MAX_FRAMES = 60
@@ -20,7 +20,7 @@ def run(ctx: Context) -> dict[str, Any]:
     (ctx.scratch / "video").write_bytes(ctx.get_artifact(video))
     ctx.progress(0.3, f"sampling {name} at {fps:g} frames a second")
     # One more than is kept, to know whether there were more.
-    sampling = ["-i", "video", "-vf", f"fps={fps:g}", "-frames:v", str(MAX_FRAMES + 1), "-q:v", "3"]
+    sampling = [*opened("video"), "-vf", f"fps={fps:g}", "-frames:v", str(MAX_FRAMES + 1), "-q:v", "3"]
     ffmpeg(ctx, [*sampling, "extracted-%04d.jpg"], what=f"decoding {name}")
     files = sorted(ctx.scratch.glob("extracted-*.jpg"))
     if not files:

@@ -1,7 +1,7 @@
 """Migration of one gateway, put together: what gives runs away, what takes them, what moves those it coordinates.
 
 - `Requesting`: step 1 of migration, the request. The gateway says which runs are to leave it, and asks the coordinators
-  of each. The request is put, so that the log and whoever watches has it; the coordinators answer for their runs one by
+  of each. The request is put, for the log and all who watch; the coordinators answer for their runs one by
   one.
 - `Draining`: the gateway gives all its runs away, before it stops or because an operator wants it empty. Runs that have
   not begun are moved at once, the others with a checkpoint. What cannot be moved (yet) is asked for again now and then
@@ -19,27 +19,25 @@ from collections.abc import Callable, Iterable, Sequence
 import structlog
 
 from appliance.errors import PayloadError, SwiftbotError
-from appliance.model import GatewayStatus, RunRequest, encode
-from appliance.plane.node import Plane
-from appliance.pool.pool import Pool
-from appliance.tasks.api import (
+from appliance.model import GatewayStatus, keyspace
+from appliance.model.task_api import (
     DrainAsk,
     DrainState,
     DrainStateAsk,
-    HoldAsk,
     MigrateAsk,
     Migrated,
     MigrationRequest,
-    MoveAsk,
     Reason,
     Remaining,
-    RunAsk,
     UndrainAsk,
 )
+from appliance.plane.node import Plane
+from appliance.pool.pool import Pool
+from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.audit import Audit
-from appliance.tasks.executor import Executor, Here
-from appliance.tasks.migration.handoff import Leaving, Taking
-from appliance.tasks.migration.moving import Moving, Tasks
+from appliance.tasks.executor import Executor
+from appliance.tasks.handoff import Here, Reservations, Source, Target, run_of
+from appliance.tasks.migration.moving import Coordinator, Moving
 from appliance.tasks.migration.policy import Candidate, Load, Overload, Room, busy, may_leave
 from appliance.tasks.settings import MigrationConfig
 
@@ -58,23 +56,18 @@ class Requesting:
             node=self._plane.gateway,
             num_containers=len(runs),
             requirements=tuple(each.request.need for each in runs),
-            runs=tuple(_ask(each) for each in runs),
+            runs=tuple(run_of(each.request) for each in runs),
             why=why,
             at_ns=time.time_ns(),
         )
-        self._plane.session.put(self._plane.keys.migration(self._plane.gateway), encode(request))
+        self._plane.session.publish(keyspace.MIGRATION, request, self._plane.gateway)
 
     async def move(self, run: Here, reason: Reason, why: str) -> Migrated:
         """Have one moved by the coordinator of its task; errors as for `Moving.migrate`."""
-        ask = _ask(run)
+        ask = run_of(run.request)
         return await self._moving.migrate(
             MigrateAsk(task=ask.task, subtask=ask.subtask, attempt=ask.attempt, reason=reason, why=why)
         )
-
-
-def _ask(run: Here) -> RunAsk:
-    request = run.request
-    return RunAsk(task=request.task, subtask=request.subtask, attempt=request.attempt)
 
 
 log = structlog.get_logger(__name__)
@@ -106,7 +99,7 @@ class Draining:
     Args:
         gateway: this gateway.
         executor: the runs here; takes none while it drains.
-        leaving: which of them may be moved.
+        source: which of them may be moved.
         requesting: asks for it.
         config: section `[tasks.migration]`.
         on_change: called when there is something to show.
@@ -117,14 +110,14 @@ class Draining:
         gateway: str,
         *,
         executor: Executor,
-        leaving: Leaving,
+        source: Source,
         requesting: Requesting,
         config: MigrationConfig,
         on_change: Callable[[], None],
     ) -> None:
         self._gateway = gateway
         self._executor = executor
-        self._leaving = leaving
+        self._source = source
         self._requesting = requesting
         self._at_once = 2 * config.at_once
         self._on_change = on_change
@@ -232,7 +225,7 @@ class Draining:
             left = self._left.setdefault(run, _Left(each.request.skill))
             if run in self._moving or left.again_at > now:
                 continue
-            if each.began and self._leaving.mobility(each.request) == "never":
+            if each.began and self._source.mobility(each.request) == "never":
                 left.why = "commands a robot and may not be moved: its end is waited for"
             elif not each.request.coordinator:
                 left.why = "no coordinator has sent it: its end is waited for"
@@ -265,10 +258,8 @@ class Draining:
         """The deadline has passed: end what is left; it is repeated elsewhere."""
         for run, each in self._executor.here().items():
             log.warning("a run is cancelled: the drain's deadline has passed", run=run)
-            request = each.request
-            ask = RunAsk(task=request.task, subtask=request.subtask, attempt=request.attempt)
             with contextlib.suppress(SwiftbotError):
-                await self._executor.cancel(ask)
+                await self._executor.cancel(run_of(each.request))
         for _ in range(int(CANCEL_S / TICK_S)):
             if not self._executor.here():
                 return
@@ -295,7 +286,7 @@ class Shedding:
     Args:
         plane: the fleet.
         executor: the runs here.
-        leaving: which of them may be moved.
+        source: which of them may be moved.
         requesting: asks for it.
         config: section `[tasks.migration]`.
         load: what the gateway sees of itself.
@@ -308,7 +299,7 @@ class Shedding:
         plane: Plane,
         *,
         executor: Executor,
-        leaving: Leaving,
+        source: Source,
         requesting: Requesting,
         config: MigrationConfig,
         load: Callable[[], Load],
@@ -318,7 +309,7 @@ class Shedding:
         self.overload = Overload(config)
         self._plane = plane
         self._executor = executor
-        self._leaving = leaving
+        self._source = source
         self._requesting = requesting
         self._config = config
         self._load = load
@@ -377,8 +368,7 @@ class Shedding:
 
     def _candidate(self, run: str, here: Here, now: float) -> Candidate:
         request = here.request
-        mobility = self._leaving.mobility(request)
-        ask = RunAsk(task=request.task, subtask=request.subtask, attempt=request.attempt)
+        mobility = self._source.mobility(request)
         return Candidate(
             id=run,
             mobile=may_leave(request, mobility, began=here.began, others=self._plane.members() - {self._plane.gateway}),
@@ -386,7 +376,7 @@ class Shedding:
             cpu=request.need.cpu,
             elapsed_s=now - here.since,
             expected_s=request.expected_s,
-            saved=self._executor.saved(ask),
+            saved=self._executor.saved(run_of(request)),
             state_mb=self._volumes_mb(request.need.volumes) if request.need.volumes else 0.0,
             moves=request.moves,
         )
@@ -424,8 +414,10 @@ class Migration:
         plane: the fleet.
         pool: this gateway's containers.
         executor: its runs.
-        leaving: made before the others, since the handlers' calls go through it.
-        tasks: the tasks that are coordinated here.
+        source: runs of it that are about to go.
+        reservations: containers held for runs that come; the executor has it too.
+        coordinator: of a task that is coordinated here; None for others.
+        manifest: of a skill; NotFoundError when it is not known.
         config: section `[tasks.migration]`.
         load: what the gateway sees of itself.
         volumes_mb: size of the state volumes of these names here, MB.
@@ -439,8 +431,10 @@ class Migration:
         pool: Pool,
         *,
         executor: Executor,
-        leaving: Leaving,
-        tasks: Tasks,
+        source: Source,
+        reservations: Reservations,
+        coordinator: Callable[[str], Coordinator | None],
+        manifest: Callable[[str], SkillManifest],
         config: MigrationConfig,
         load: Callable[[], Load],
         volumes_mb: Callable[[Iterable[str]], float],
@@ -448,39 +442,40 @@ class Migration:
         audit: Audit,
     ) -> None:
         self._plane = plane
-        self._leaving = leaving
+        self._source = source
         self._audit = audit
-        self._moving = Moving(plane, tasks, config)
+        self._moving = Moving(plane, coordinator=coordinator, manifest=manifest, config=config)
         requesting = Requesting(plane, self._moving)
         self.shedding = Shedding(
-            plane, executor=executor, leaving=leaving, requesting=requesting, config=config, load=load,
+            plane, executor=executor, source=source, requesting=requesting, config=config, load=load,
             volumes_mb=volumes_mb, on_change=on_change,
         )  # fmt: skip
         self.draining = Draining(
-            plane.gateway, executor=executor, leaving=leaving, requesting=requesting, config=config,
+            plane.gateway, executor=executor, source=source, requesting=requesting, config=config,
             on_change=on_change,
         )  # fmt: skip
-        self._taking = Taking(plane.gateway, pool, executor, warm=pool.verbs.warm, config=config)
-        self._taking.refuses = lambda: self.shedding.reason
-        self._taking.on_taken = lambda: self.shedding.overload.received(time.monotonic())
-        executor.reserved = self._taking.reserved
+        shedding = self.shedding
+        self._target = Target(
+            plane.gateway, executor, reservations=reservations, warm=pool.verbs.warm, config=config,
+            refuses=lambda: shedding.reason, on_taken=lambda: shedding.overload.received(time.monotonic()),
+        )  # fmt: skip
         self._looking: asyncio.Task[None] | None = None
 
     def start(self) -> None:
         """Answer the verbs, and begin to look at the load."""
         rpc = self._plane.rpc
         signed = self._audit.signed
-        rpc.register("migrate", MigrateAsk, signed("migrate", self._moving.migrate, when=_by_operator))
-        rpc.register("migrate_here", MigrateAsk, self._moving.migrate_here)
-        rpc.register("migrate_cancel", MoveAsk, self._moving.cancel)
-        rpc.register("run_hold", HoldAsk, self._leaving.hold)
-        rpc.register("run_resume", RunAsk, self._leaving.resume)
-        rpc.register("run_leave", RunAsk, self._leaving.leave)
-        rpc.register("run_reserve", RunRequest, self._taking.reserve)
-        rpc.register("run_unreserve", RunAsk, self._taking.unreserve)
-        rpc.register("drain", DrainAsk, signed("drain", self.draining.drain))
-        rpc.register("undrain", UndrainAsk, signed("undrain", self.draining.undrain))
-        rpc.register("drain_state", DrainStateAsk, self.draining.ask_state)
+        rpc.register(keyspace.MIGRATE, signed("migrate", self._moving.migrate, when=_by_operator))
+        rpc.register(keyspace.MIGRATE_HERE, self._moving.migrate_here)
+        rpc.register(keyspace.MIGRATE_CANCEL, self._moving.cancel)
+        rpc.register(keyspace.RUN_HOLD, self._source.hold)
+        rpc.register(keyspace.RUN_RESUME, self._source.resume)
+        rpc.register(keyspace.RUN_LEAVE, self._source.leave)
+        rpc.register(keyspace.RUN_RESERVE, self._target.reserve)
+        rpc.register(keyspace.RUN_UNRESERVE, self._target.unreserve)
+        rpc.register(keyspace.DRAIN, signed("drain", self.draining.drain))
+        rpc.register(keyspace.UNDRAIN, signed("undrain", self.draining.undrain))
+        rpc.register(keyspace.DRAIN_STATE, self.draining.ask_state)
         self._looking = asyncio.create_task(self.shedding.run(), name="looks at the load")
 
     async def close(self) -> None:

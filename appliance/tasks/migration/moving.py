@@ -1,6 +1,6 @@
 """Moves a run, at the coordinator of its task: steps 2 to 4 of the paper's migration.
 
-    fetch by key   the record, at the gateway that owns the task's key, where its driver is
+    fetch by key   the record, at the gateway that owns the task's key, where its coordinator is
     closest node   candidates by what is known; the best holds a container for the run, or says why not, and then
                    the next best is asked: nothing has happened to the run yet
     hold           the run's gateway brings it to a safe point and has its checkpoint kept
@@ -14,10 +14,9 @@ counts against nothing. A coordinator that dies leaves one or the other; both ho
 """
 
 import asyncio
-import contextlib
 import time
-from collections.abc import Awaitable, Callable, Coroutine
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Protocol
 
 import structlog
 from msgspec.structs import replace
@@ -26,77 +25,56 @@ from appliance.errors import (
     CancelledByOperatorError,
     NotFoundError,
     RefusedError,
-    SwiftbotError,
     UnreachableError,
 )
-from appliance.model import RunRequest, SubtaskRecord, SubtaskState, TaskRecord
-from appliance.plane.keys import check_name
-from appliance.plane.node import Plane
-from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.api import (
-    Held,
-    HoldAsk,
+from appliance.model import RunRequest, SubtaskRecord, SubtaskState, TaskRecord, keyspace
+from appliance.model.keys import check_name
+from appliance.model.task_api import (
     MigrateAsk,
     Migrated,
     MoveAsk,
     MoveCancelled,
     Reason,
     Reserved,
-    RunAsk,
-    RunStatus,
     Weighed,
 )
-from appliance.tasks.context import Input, MoveReady, task_key
+from appliance.plane.events import FleetEvent, Lost, Stage
+from appliance.plane.node import Plane
+from appliance.skills.catalogue import SkillManifest
+from appliance.tasks.events import Event, MoveReady
+from appliance.tasks.handoff import Handoff, Outcome, run_of
 from appliance.tasks.migration.policy import History, Place, closest
 from appliance.tasks.orders import request_for
 from appliance.tasks.placement import holds
-from appliance.tasks.records import MAX_NOTE, clean
+from appliance.tasks.records import MAX_NOTE, clean, task_key
 from appliance.tasks.settings import MigrationConfig
 
 log = structlog.get_logger(__name__)
 
 TRIES = 4
 """Gateways that are asked to take one run."""
-RESERVE_S = 10.0
-"""How long one of them may take: it may have to start a container."""
-HOLD_S = 6.0
-"""How long the run's gateway may take to bring it to a safe point."""
 WRITE_S = 8.0
-"""How long the driver may take to write the record."""
+"""How long the coordinator may take to write the record."""
 START_S = 15.0
 """How long the start elsewhere is waited for; it goes on in any case."""
-DRIVER_S = 2.0
-"""How long a driver that is being set up is waited for."""
-MOVE_S = 60.0
-"""What whoever asks should wait at most."""
+COORDINATOR_S = 2.0
+"""How long a coordinator that is being set up is waited for."""
 MOST_MOVES = 64
 """Moves that one coordinator carries out at the same time."""
 MOST_ATTEMPTS = 64
 """A record must stay small: a subtask with so many attempts is left where it is."""
 
 
-class Driver(Protocol):
-    """What is needed of a task's driver."""
+class Coordinator(Protocol):
+    """What is needed of a task's coordinator."""
 
     @property
     def record(self) -> TaskRecord:
         """The task as it stands."""
         ...
 
-    def tell(self, news: Input) -> None:
-        """Hand in what happened."""
-        ...
-
-
-class Tasks(Protocol):
-    """What is needed of the task manager."""
-
-    def driver(self, task: str) -> Driver | None:
-        """The driver of a task that is coordinated here."""
-        ...
-
-    def manifest(self, skill: str) -> SkillManifest:
-        """A skill's manifest; NotFoundError when it is not known."""
+    def put(self, event: Event) -> None:
+        """Hand in an event."""
         ...
 
 
@@ -114,17 +92,30 @@ class Moving:
 
     Args:
         plane: the fleet.
-        tasks: the tasks driven here.
+        coordinator: of a task that is coordinated here; None for others.
+        manifest: of a skill; NotFoundError when it is not known.
         config: section `[tasks.migration]`.
     """
 
-    def __init__(self, plane: Plane, tasks: Tasks, config: MigrationConfig) -> None:
+    def __init__(
+        self,
+        plane: Plane,
+        *,
+        coordinator: Callable[[str], Coordinator | None],
+        manifest: Callable[[str], SkillManifest],
+        config: MigrationConfig,
+    ) -> None:
         self._plane = plane
-        self._tasks = tasks
+        self._coordinator_of = coordinator
+        self._manifest = manifest
         self._config = config
         self._history = History()
         self._moves: dict[tuple[str, str], _Move] = {}
-        plane.on_member_lost.append(self._history.forget)
+        plane.events.subscribe(Stage.OFFLOAD, self._on_event)
+
+    def _on_event(self, event: FleetEvent) -> None:
+        if isinstance(event, Lost):
+            self._history.forget(event.gateway)
 
     # --- the door ---------------------------------------------------------------------------------------------
 
@@ -140,7 +131,7 @@ class Moving:
         owner = await self._plane.owner_of(task_key(check_name(ask.task, "task")))
         if owner == self._plane.gateway:
             return await self.migrate_here(ask)
-        return await self._plane.rpc.call(owner, "migrate_here", ask, Migrated, timeout_s=MOVE_S)
+        return await self._plane.rpc.call(owner, keyspace.MIGRATE_HERE, ask)
 
     async def migrate_here(self, ask: MigrateAsk) -> Migrated:
         """Move a subtask's run of a task that is coordinated here; errors as above."""
@@ -163,13 +154,13 @@ class Moving:
     def _moved(self, key: tuple[str, str], done: "asyncio.Task[Migrated]") -> None:
         self._moves.pop(key, None)
         if not done.cancelled():
-            done.exception()  # whoever asked has it
+            done.exception()  # the asker has it
 
     async def cancel(self, ask: MoveAsk) -> MoveCancelled:
         """Call a move off, wherever it is carried out; False when there is none, or its record is written."""
         owner = await self._plane.owner_of(task_key(check_name(ask.task, "task")))
         if owner != self._plane.gateway:
-            return await self._plane.rpc.call(owner, "migrate_cancel", ask, MoveCancelled)
+            return await self._plane.rpc.call(owner, keyspace.MIGRATE_CANCEL, ask)
         move = self._moves.get((ask.task, ask.subtask))
         if move is None or move.written:
             return MoveCancelled(cancelled=False)
@@ -194,28 +185,33 @@ class Moving:
             now = time.monotonic()
             steps[name], at = round((now - at) * 1e3, 3), now
 
-        driver = await self._driver(ask.task)
-        target = _movable(driver.record, ask)
-        manifest = self._tasks.manifest(target.subtask.skill)
+        coordinator = await self._coordinator(ask.task)
+        target = _movable(coordinator.record, ask)
+        manifest = self._manifest(target.subtask.skill)
         if manifest.mobility == "never" and target.state is SubtaskState.RUNNING:
             raise RefusedError(
                 f"{target.subtask.skill} commands a robot and may not be moved",
                 remedy="wait until it ends; its manifest says that it must not migrate (`migratable`)",
             )
         request = request_for(
-            driver.record, target, manifest, robot=target.bound_robot, coordinator=self._plane.gateway
+            coordinator.record, target, manifest, robot=target.bound_robot, coordinator=self._plane.gateway
         )
         step("fetch")
-        reserved, considered = await self._find(ask, driver.record, target, request)
-        step("find")
-        async with contextlib.AsyncExitStack() as undo:
-            undo.push_async_callback(self._quietly, self._unreserve(reserved.gateway, request))
-            held = await self._hold(target, request.task, undo)
+        offers = Closest(lambda tried: self._weigh(ask, coordinator.record, target, request, tried), self._history)
+        async with Handoff(self._plane, request) as handoff:
+            reserved = await handoff.reserve(offers)
+            if reserved is None:
+                raise RefusedError(
+                    f"no gateway takes {ask.subtask}: {offers.reasons() or 'there is no other'}"[:MAX_NOTE],
+                    remedy="it goes on where it is",
+                )
+            step("find")
+            held = await handoff.hold(target.gateway, replace(run_of(request), attempt=target.attempt))
             step("hold")
-            await self._write(ask, driver, target, request, reserved)
-            undo.pop_all()  # from here on the new attempt is the one that counts
+            await self._write(ask, coordinator, target, request, reserved)
+            handoff.commit()
         step("write")
-        started, what = await self._started(driver, request)
+        started, what = await self._started(coordinator, request)
         step("start")
         self._history.went(reserved.gateway, well=started)
         took_ms = round((time.monotonic() - began) * 1e3, 3)
@@ -230,47 +226,25 @@ class Moving:
             source=target.gateway,
             target=reserved.gateway,
             attempt=request.attempt,
-            why=what or _told(considered),
+            why=what or _told(offers.considered),
             checkpoint="fresh" if held.fresh else "last" if held.saved else "",
             started=started,
             took_ms=took_ms,
             steps_ms=steps,
-            considered=tuple(considered[:12]),
+            considered=tuple(offers.considered[:12]),
         )
 
-    async def _driver(self, task: str) -> Driver:
-        """Fetch by key: the driver of a task whose key this gateway owns, which may only be setting it up."""
-        until = time.monotonic() + DRIVER_S
-        while (driver := self._tasks.driver(task)) is None:
+    async def _coordinator(self, task: str) -> Coordinator:
+        """Fetch by key: the coordinator of a task whose key this gateway owns, which may only be setting it up."""
+        until = time.monotonic() + COORDINATOR_S
+        while (coordinator := self._coordinator_of(task)) is None:
             if time.monotonic() > until:
                 stored = await self._plane.dht.read(task_key(task))
                 if stored is None:
                     raise NotFoundError(f"there is no task {task}", remedy="see `swiftbot task list`")
                 raise RefusedError(f"task {task} has ended, or is not driven by {self._plane.gateway} just now")
             await asyncio.sleep(0.05)
-        return driver
-
-    async def _find(
-        self, ask: MigrateAsk, record: TaskRecord, target: SubtaskRecord, request: RunRequest
-    ) -> tuple[Reserved, list[Weighed]]:
-        """Find the closest node and have it hold a container; RefusedError when none does, with all reasons."""
-        tried: dict[str, str] = {}
-        while True:
-            weighed = self._weigh(ask, record, target, request, tried)
-            if not weighed or weighed[0].verdict or len(tried) >= TRIES:
-                reasons = "; ".join(f"{each.gateway}: {each.verdict}" for each in weighed if each.verdict)
-                raise RefusedError(
-                    f"no gateway takes {ask.subtask}: {reasons or 'there is no other'}"[:MAX_NOTE],
-                    remedy="it goes on where it is",
-                )
-            gateway = weighed[0].gateway
-            try:
-                reserved = await self._plane.rpc.call(gateway, "run_reserve", request, Reserved, timeout_s=RESERVE_S)
-            except SwiftbotError as error:
-                tried[gateway] = clean(error.message, 120)
-                self._history.went(gateway, well=False)
-            else:
-                return reserved, [replace(weighed[0], verdict="taken"), *weighed[1:]]
+        return coordinator
 
     def _weigh(
         self, ask: MigrateAsk, record: TaskRecord, target: SubtaskRecord, request: RunRequest, tried: dict[str, str]
@@ -304,25 +278,17 @@ class Moving:
             lenient=ask.reason is not Reason.OVERLOAD,
         )
 
-    async def _hold(self, target: SubtaskRecord, task: str, undo: contextlib.AsyncExitStack) -> Held:
-        """Have the run brought to a safe point; it is let go on again unless the record is written."""
-        ask = HoldAsk(task=task, subtask=target.subtask.id, attempt=target.attempt)
-        run = RunAsk(task=task, subtask=target.subtask.id, attempt=target.attempt)
-        # Also when the answer is lost: it may be held all the same.
-        undo.push_async_callback(self._quietly, self._resume(target.gateway, run))
-        return await self._plane.rpc.call(target.gateway, "run_hold", ask, Held, timeout_s=HOLD_S)
-
     async def _write(
-        self, ask: MigrateAsk, driver: Driver, target: SubtaskRecord, request: RunRequest, reserved: Reserved
+        self, ask: MigrateAsk, coordinator: Coordinator, target: SubtaskRecord, request: RunRequest, reserved: Reserved
     ) -> None:
-        """Migrate: have the driver write the record with the new attempt."""
-        # It may have ended while it was held; a driver whose task has ended hears nothing any more.
-        _movable(driver.record, replace(ask, attempt=target.attempt))
+        """Migrate: have the coordinator write the record with the new attempt."""
+        # It may have ended while it was held; a coordinator whose task has ended hears nothing any more.
+        _movable(coordinator.record, replace(ask, attempt=target.attempt))
         if (move := self._moves.get((ask.task, ask.subtask))) is not None:
             move.written = True
         outcome: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         because = f"{ask.reason}: {ask.why}" if ask.why else str(ask.reason)
-        driver.tell(
+        coordinator.put(
             MoveReady(
                 subtask=ask.subtask,
                 attempt=target.attempt,
@@ -337,18 +303,18 @@ class Moving:
             async with asyncio.timeout(WRITE_S):
                 await asyncio.shield(outcome)
         except TimeoutError:
-            # Given up by its future: a driver that comes to it later does nothing. One that is writing it just now
+            # Given up by its future: a coordinator that comes to it later does nothing. One that is writing it just now
             # makes a new attempt that finds no container held, which is repeated like any other.
             outcome.cancel()
             raise UnreachableError(
                 f"the record of task {ask.task} could not be written in time", remedy="the run goes on; try again"
             ) from None
 
-    async def _started(self, driver: Driver, request: RunRequest) -> tuple[bool, str]:
+    async def _started(self, coordinator: Coordinator, request: RunRequest) -> tuple[bool, str]:
         """Wait until the new attempt has run its first line; otherwise what became of it."""
         until = time.monotonic() + START_S
         while time.monotonic() < until:
-            target = driver.record.of(request.subtask)
+            target = coordinator.record.of(request.subtask)
             attempt = next((each for each in target.attempts if each.number == request.attempt), None)
             if attempt is not None and attempt.failure is not None:
                 return False, f"moved, but its start there failed and is repeated: {attempt.failure.message}"
@@ -359,27 +325,36 @@ class Moving:
             await asyncio.sleep(0.01)
         return False, f"moved; its first line there was not heard of within {START_S:g} s"
 
-    # --- undoing ----------------------------------------------------------------------------------------------
 
-    def _unreserve(self, gateway: str, request: RunRequest) -> Callable[[], Awaitable[RunStatus]]:
-        ask = RunAsk(task=request.task, subtask=request.subtask, attempt=request.attempt)
-        return lambda: self._plane.rpc.call(gateway, "run_unreserve", ask, RunStatus, timeout_s=2.0)
+class Closest:
+    """Offers for a run in progress: the gateways that `weigh` finds, given those that refused and why."""
 
-    def _resume(self, gateway: str, run: RunAsk) -> Callable[[], Awaitable[RunStatus]]:
-        return lambda: self._plane.rpc.call(gateway, "run_resume", run, RunStatus, timeout_s=2.0)
+    def __init__(self, weigh: Callable[[dict[str, str]], list[Weighed]], history: History) -> None:
+        self.considered: list[Weighed] = []
+        """All gateways as they were weighed last, the one that was asked first."""
+        self._weigh = weigh
+        self._history = history
+        self._refused: dict[str, str] = {}
 
-    async def _quietly(self, work: Callable[[], Awaitable[RunStatus]]) -> None:
-        """Undo something, also when the move is cancelled; what cannot be undone now ends by itself."""
+    async def best(self) -> str:
+        """Find the closest node."""
+        self.considered = self._weigh(self._refused)
+        if not self.considered or self.considered[0].verdict or len(self._refused) >= TRIES:
+            return ""
+        return self.considered[0].gateway
 
-        async def go() -> None:
-            with contextlib.suppress(SwiftbotError):
-                await work()
+    def note(self, outcome: Outcome) -> None:
+        """Note whether it holds a container; where it does not, nothing has happened to the run."""
+        if outcome.taken:
+            self.considered[0] = replace(self.considered[0], verdict="taken")
+            return
+        gateway = self.considered[0].gateway
+        self._refused[gateway] = clean(outcome.reason, 120)
+        self._history.went(gateway, well=False)
 
-        await asyncio.shield(asyncio.ensure_future(_coroutine(go())))
-
-
-async def _coroutine(work: Coroutine[Any, Any, None]) -> None:
-    await work
+    def reasons(self) -> str:
+        """Say why no gateway holds a container for it."""
+        return "; ".join(f"{each.gateway}: {each.verdict}" for each in self.considered if each.verdict)
 
 
 def _movable(record: TaskRecord, ask: MigrateAsk) -> SubtaskRecord:

@@ -36,7 +36,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 from msgspec import Struct
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RunRequest
-from appliance.tasks.api import Weighed
+from appliance.model.task_api import Weighed
 from appliance.tasks.settings import MigrationConfig
 
 

@@ -9,7 +9,7 @@ A gateway's state is worked out once for all of them, so that none calls well wh
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import cast
 
 from msgspec import Struct
@@ -19,15 +19,18 @@ from textual import on
 from textual.app import ComposeResult
 from textual.widgets import Static
 
+from appliance.alerts.rules import alert_id
 from appliance.errors import SwiftbotError
-from appliance.model import ContainerInfo, Phase, SubtaskState
-from appliance.pool.api import PoolDecision
-from appliance.record.models import RecorderStatus, kinds_text
+from appliance.model import ContainerInfo, GatewayStatus, Phase, SubtaskState
+from appliance.model.pool_api import PoolDecision
+from appliance.model.recorder_api import RecorderStatus
+from appliance.reasons import time_of_day
+from appliance.record.models import kinds_text
 from appliance.tui import status_styles
 from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen
 from appliance.tui.command_line import plain_image
-from appliance.tui.formatting import Cell, age, bar, counted, hanging, milliseconds, sparkline, time_of_day
+from appliance.tui.formatting import Cell, age, bar, counted, hanging, milliseconds, sparkline
 from appliance.tui.safe import safe
 from appliance.tui.store import SILENT, Gateway, Start, Store
 from appliance.tui.widgets.grid import Column, Grid
@@ -38,6 +41,8 @@ class Note(Struct, frozen=True, kw_only=True):
 
     weight: int
     """0: gone; 1: broken; 2: works less than it could; 3: the machine lacks something; 4: for information."""
+    kind: str = ""
+    """Of its alert; empty: it has none."""
     about: str
     """`gateway`, or `pool` for what keeps containers from being started."""
     glyph: str
@@ -46,7 +51,7 @@ class Note(Struct, frozen=True, kw_only=True):
     remedy: str = ""
 
     def line(self, name: str = "") -> Text:
-        """Return it as a line, with a gateway's name before it where several are told of."""
+        """Return it as a line, with a gateway's name before it where there are several."""
         told = f"{safe(name, 63)}: {self.text}" if name else self.text
         return Text(f"{self.glyph} {told}{f' → {self.remedy}' if self.remedy else ''}", self.style)
 
@@ -72,25 +77,32 @@ def notes_of(gateway: Gateway) -> list[Note]:
     each, name = gateway.status, safe(gateway.status.id, 63)
     if gateway.lost_ns:
         gone = f"not reachable since {time_of_day(gateway.lost_ns)}"
-        remedy = "see to its power, network, service"
-        return [Note(weight=0, about="gateway", glyph="✘", style="red", text=gone, remedy=remedy)]
+        remedy = "check power and network, then: systemctl status swiftbot-gateway"
+        return [Note(kind="gateway-lost", weight=0, about="gateway", glyph="✘", style="red", text=gone, remedy=remedy)]
     found: list[Note] = []
     if each.pool_problem:
         text, remedy = safe(each.pool_problem), _pool_remedy(each.pool_problem, name)
-        found.append(Note(weight=1, about="pool", glyph="✘", style="red", text=text, remedy=remedy))
+        found.append(Note(kind="pool", weight=1, about="pool", glyph="✘", style="red", text=text, remedy=remedy))
     if each.overloaded:
         text, remedy = safe(each.overloaded), "its runs are moved away by themselves; `:drain` gives all away"
-        found.append(Note(weight=2, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
+        found.append(
+            Note(kind="overload", weight=2, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy)
+        )
     if each.draining:
-        text, remedy = safe(each.drain) or "gives its runs away", "`:undrain` when it is to take runs again"
+        text, remedy = safe(each.drain) or "draining", "`:uncordon` schedules runs there again"
         found.append(Note(weight=2, about="gateway", glyph="◌", style="magenta", text=text, remedy=remedy))
     if not each.limits_enforced:
         text = "container limits are not enforced (no cgroups)"
         remedy = "`swiftbot doctor`"
-        found.append(Note(weight=3, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
+        found.append(
+            Note(kind="no-limits", weight=3, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy)
+        )
     if each.site_problem:
         text, remedy = safe(each.site_problem), "add [fence] to the site's file: points outside it are then refused"
-        found.append(Note(weight=3, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
+        found.append(Note(kind="site", weight=3, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
+    if each.keys_problem:
+        text, remedy = safe(each.keys_problem), "`swiftbot keys list`, then `swiftbot keys renew ROLE NAME`"
+        found.append(Note(kind="keys", weight=2, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
     if refused := sum(each.refused.values()):
         kinds = ", ".join(f"{safe(kind, 40)} {count}" for kind, count in sorted(each.refused.items()))
         text = f"{refused} bad inputs refused ({kinds})"
@@ -107,14 +119,22 @@ def _pool_remedy(problem: str, gateway: str) -> str:
     return "`swiftbot doctor` there says why"
 
 
-def gateway_notes(gateways: Iterable[Gateway], *, about: str = "") -> list[Text]:
+def gateway_notes(
+    gateways: Iterable[Gateway], *, about: str = "", acked: Callable[[str], bool] = lambda _: False
+) -> list[Text]:
     """Return what is to be known of several gateways, a line each, the worst first.
 
     Args:
-        gateways: of which it is told.
+        gateways: that it concerns.
         about: only what concerns this (`Note.about`); empty: everything.
+        acked: whether somebody has acknowledged the alert of an id: such lines are left out.
     """
-    found = [(note, each.status.id) for each in gateways for note in notes_of(each) if about in ("", note.about)]
+    found = [
+        (note, each.status.id)
+        for each in gateways
+        for note in notes_of(each)
+        if about in ("", note.about) and not acked(alert_id(note.kind, each.status.id))
+    ]
     return [note.line(name) for note, name in sorted(found, key=lambda each: each[0].weight)]
 
 
@@ -143,7 +163,7 @@ CONTAINERS = (
     Column(title="gateway", width=8, grow=True),
     Column(title="state", width=10),
     Column(title="age", width=5, right=True),
-    Column(title="hits", width=4, right=True),
+    Column(title="runs", width=4, right=True),
     Column(title="cpu/mem", width=9, right=True),
     Column(title="running now", width=13, grow=True),
     Column(title="cold", width=8, right=True, drop=1),
@@ -229,11 +249,6 @@ class PoolScreen(FleetScreen):
     scope = "pool"
     shows = ("containers", "starts", "asked", "gateways")
     BINDINGS = bindings("pool")
-    DEFAULT_CSS = """
-    PoolScreen #starts { height: auto; padding: 0 1; border-top: solid $foreground 30%; }
-    PoolScreen #problems { height: auto; max-height: 4; padding: 0 1; }
-    PoolScreen #decisions { height: auto; max-height: 40%; padding: 0 1; }
-    """
 
     def body(self) -> ComposeResult:
         """Make the parts."""
@@ -296,7 +311,7 @@ GATEWAY_CONTAINERS = (
     Column(title="container", width=12),
     Column(title="image", width=12, grow=True),
     Column(title="state", width=11),
-    Column(title="hits", width=5, right=True),
+    Column(title="runs", width=5, right=True),
     Column(title="cold", width=8, right=True, drop=1),
     Column(title="cpu/mem", width=9, right=True, drop=2),
     Column(title="running now", width=22, grow=True),
@@ -362,11 +377,6 @@ class GatewayScreen(FleetScreen):
     tab = "fleet"
     shows = ("gateways", "containers", "robots", "tasks", "entries")
     BINDINGS = bindings("gateway")
-    DEFAULT_CSS = """
-    GatewayScreen #about { height: auto; padding: 0 1; }
-    GatewayScreen #runs { height: auto; max-height: 6; padding: 0 1; }
-    GatewayScreen #lines { height: auto; max-height: 8; padding: 0 1; }
-    """
 
     def __init__(self, gateway: str) -> None:
         super().__init__()
@@ -425,13 +435,13 @@ GATEWAYS = (
     Column(title="runs", width=5, right=True),
     Column(title="tasks", width=5, right=True),
     Column(title="link", width=7, right=True),
-    Column(title="arc", width=4, right=True),
+    Column(title="ring", width=4, right=True),
     Column(title="version", width=7),
     Column(title="up", width=5, right=True, drop=1),
     Column(title="busy", width=16, drop=2),
     Column(title="robots", width=16, grow=True, drop=3),
 )
-"""All that is to be told of a gateway stands at 80 columns, beside a scroll bar."""
+"""All columns fit at 80 columns, beside a scroll bar."""
 _MOST_NOTES = 6
 
 
@@ -465,11 +475,8 @@ class FleetOverview(FleetScreen):
     """All gateways; Enter shows one whole."""
 
     scope = "fleet"
-    shows = ("gateways", "recorders")
+    shows = ("gateways", "recorders", "alerts")
     BINDINGS = bindings("fleet")
-    DEFAULT_CSS = """
-    FleetOverview #notes { height: auto; max-height: 8; padding: 0 1; }
-    """
 
     def body(self) -> ComposeResult:
         """Make the parts."""
@@ -478,18 +485,28 @@ class FleetOverview(FleetScreen):
 
     def draw_body(self, store: Store) -> None:
         """Show the gateways by name."""
-        rows = {name: store.gateways[name] for name in sorted(store.gateways)}
+        known = dict(store.gateways.items())
+        for each in store.alerts.values():
+            # Lost before this terminal UI was opened: its name is all that is known of it.
+            if each.kind == "gateway-lost" and each.name not in known:
+                known[each.name] = Gateway(
+                    status=GatewayStatus(id=each.name, fleet=self.view.fleet), lost_ns=each.since_ns
+                )
+        rows = {name: known[name] for name in sorted(known)}
         shown = self.filtered(rows, _text)
         empty = "no gateway matches the filter" if rows else "no gateway is known yet"
         self.query_one("#gateways", Grid).show(shown, empty=empty)
-        lines = gateway_notes(rows.values())
+        acked = store.acked
+        lines = gateway_notes(rows.values(), acked=acked)
         more = len(lines) - _MOST_NOTES
         if more > 0:
             lines = [
                 *lines[:_MOST_NOTES],
                 Text(f"… {more} more of the same kind: Enter on a gateway shows its own", "dim"),
             ]
-        lines += recorder_notes(store.recorders[name] for name in sorted(store.recorders))
+        lines += recorder_notes(
+            store.recorders[name] for name in sorted(store.recorders) if not acked(alert_id("recorder", name))
+        )
         self.say("#notes", Text("\n").join(lines))
 
     def chosen(self) -> dict[str, str]:

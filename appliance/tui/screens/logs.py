@@ -10,12 +10,13 @@ from textual.app import ComposeResult
 from textual.widgets import Static
 
 from appliance.errors import PayloadError, SwiftbotError
-from appliance.plane.keys import ROOT
+from appliance.model.keys import ROOT
 from appliance.plane.session import Closer, Message, Session
+from appliance.reasons import time_of_day
 from appliance.tui import status_styles
 from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen
-from appliance.tui.formatting import Heard, heard, line_text, plain, said, time_of_day
+from appliance.tui.formatting import Heard, heard, line_text, plain, said
 from appliance.tui.replay import Tap
 from appliance.tui.store import Entry, Store
 from appliance.tui.subscriptions import View
@@ -159,10 +160,6 @@ class LogScreen(FleetScreen):
     scope = "log"
     shows = ("entries",)
     BINDINGS = bindings("log")
-    DEFAULT_CSS = """
-    LogScreen #what { height: 1; padding: 0 1; color: $text-muted; }
-    LogScreen LineView { height: 1fr; }
-    """
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,8 +1,4 @@
-"""The screens of models: planning by language models, and federated learning.
-
-Planning: the model's slot of each gateway, its tiers, and how sure plans were. Learning: its rounds, once there are
-any.
-"""
+"""The screen of language models: the model's slot of each gateway, its tiers, and how sure plans were."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -26,7 +22,7 @@ GATEWAYS = (
     Column(title="queue", width=5, right=True),
     Column(title="tok/s", width=6, right=True),
     Column(title="plans", width=6, right=True),
-    Column(title="escal.", width=6, right=True),
+    Column(title="escalated", width=9, right=True),
     Column(title="share of tiers asked", width=20, grow=True),
     Column(title="model", width=14, grow=True, drop=1),
     Column(title="mem", width=6, right=True, drop=2),
@@ -137,10 +133,6 @@ class LlmScreen(FleetScreen):
     scope = "llm"
     shows = ("gateways", "tasks")
     BINDINGS = bindings("llm")
-    DEFAULT_CSS = """
-    LlmScreen #about { height: auto; max-height: 10; padding: 0 1; border-top: solid $foreground 30%; }
-    LlmScreen #share { height: auto; padding: 0 1; }
-    """
 
     def body(self) -> ComposeResult:
         """Make the parts."""
@@ -173,29 +165,3 @@ def _text(name: str, gateway: Gateway) -> str:
     return " ".join(
         [name, *gateway.status.models, slot_state(gateway.status.planner and gateway.status.planner.slot)[0]]
     )
-
-
-class LearningScreen(FleetScreen):
-    """Rounds of federated learning."""
-
-    scope = "learning"
-    shows = ("asked",)
-    BINDINGS = bindings("learning")
-    DEFAULT_CSS = """
-    LearningScreen #empty { padding: 1 2; }
-    """
-
-    def body(self) -> ComposeResult:
-        """Make the parts."""
-        yield Static(id="empty")
-
-    def draw_body(self, store: Store) -> None:
-        """Say that there are none."""
-        _ = store
-        self.query_one("#empty", Static).update(
-            Text(
-                "No rounds: this fleet has no federated learning.\n\n"
-                "A gateway of this version runs no rounds and tells of none, so there is nothing that could be shown "
-                "here. `swiftbot train` trains a gateway's own language model on one machine."
-            )
-        )

@@ -8,11 +8,10 @@ from textual import on
 from textual.app import ComposeResult
 from textual.widgets import Static
 
-from appliance.errors import PayloadError
 from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen
 from appliance.tui.formatting import Cell, clock, counted, file_size
-from appliance.tui.replay import LogFile, ReplayView, faster, find_logs, rate_of, seconds_of, slower, told
+from appliance.tui.replay import LogFile, ReplayView, find_logs, told
 from appliance.tui.safe import safe
 from appliance.tui.store import Store
 from appliance.tui.widgets.grid import Column, Grid
@@ -49,10 +48,6 @@ class ReplayScreen(FleetScreen):
     scope = "replay"
     shows = ("connection",)
     BINDINGS = bindings("replay")
-    DEFAULT_CSS = """
-    ReplayScreen #about { height: auto; padding: 0 1; }
-    ReplayScreen #files { height: 1fr; border-top: solid $foreground 30%; }
-    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -135,68 +130,3 @@ class ReplayScreen(FleetScreen):
     def _picked(self, event: Grid.Picked) -> None:
         event.stop()
         self.host.run_line(f'open "{event.key}"')
-
-    def _open_one(self) -> ReplayView | None:
-        if self.replay is None:
-            self.notify("no log is open\n→ Enter on a file, or :open FILE", severity="warning", markup=False)
-        return self.replay
-
-    def do_play(self, _given: object) -> None:
-        """Play, or pause."""
-        if (replay := self._open_one()) is None:
-            return
-        now = time.monotonic()
-        replay.head.position_ns(now)  # at the end it stands still
-        if replay.head.paused:
-            replay.head.play(now)
-        else:
-            replay.head.pause(now, paused=True)
-        self._draw_about()
-
-    def do_seek(self, given: dict[str, str]) -> None:
-        """Go to another moment."""
-        if (replay := self._open_one()) is None:
-            return
-        head, now = replay.head, time.monotonic()
-        try:
-            seconds = seconds_of(given["time"], at_s=head.position_s(now), length_s=head.length_s)
-            head.seek(head.start_ns + round(seconds * 1e9), now)
-        except PayloadError as error:
-            self.notify(f"{safe(error.message)}\n→ {error.remedy}", severity="error", markup=False)
-        self._draw_about()
-
-    def _step(self, seconds: float) -> None:
-        if (replay := self._open_one()) is not None:
-            now = time.monotonic()
-            replay.head.seek(replay.head.position_ns(now) + round(seconds * 1e9), now)
-            self._draw_about()
-
-    def do_ahead(self, _given: object) -> None:
-        """Go ten seconds on."""
-        self._step(10.0)
-
-    def do_behind(self, _given: object) -> None:
-        """Go ten seconds back."""
-        self._step(-10.0)
-
-    def do_faster(self, _given: object) -> None:
-        """Play faster."""
-        if (replay := self._open_one()) is not None:
-            replay.head.set_rate(faster(replay.head.rate), time.monotonic())
-            self._draw_about()
-
-    def do_slower(self, _given: object) -> None:
-        """Play slower."""
-        if (replay := self._open_one()) is not None:
-            replay.head.set_rate(slower(replay.head.rate), time.monotonic())
-            self._draw_about()
-
-    def do_rate(self, given: dict[str, str]) -> None:
-        """Play at a rate."""
-        if (replay := self._open_one()) is None:
-            return
-        try:
-            replay.head.set_rate(rate_of(given["rate"]), time.monotonic())
-        except PayloadError as error:
-            self.notify(f"{safe(error.message)}\n→ {error.remedy}", severity="error", markup=False)
-        self._draw_about()

@@ -1,7 +1,7 @@
 """A plan that waits for an operator: looked at, edited, checked again, approved or rejected.
 
 What is approved is bound to the plan that was looked at: its hash goes along, and a gateway refuses when another plan
-waits by then or somebody was faster. An edited plan can only be approved once a gateway's validator has seen it.
+waits by then, or another operator was faster. An edited plan can only be approved once a gateway has validated it.
 """
 
 from collections.abc import Callable, Mapping
@@ -55,12 +55,6 @@ class ReviewScreen(FleetScreen):
     tab = "tasks"
     shows = ("tasks", "robots")
     BINDINGS = bindings("review")
-    DEFAULT_CSS = """
-    ReviewScreen #about { height: auto; max-height: 5; padding: 0 1; }
-    ReviewScreen #steps { height: 1fr; min-height: 3; }
-    ReviewScreen #changes-box { height: 1fr; border-top: solid $foreground 30%; scrollbar-size: 1 1; padding: 0 1; }
-    ReviewScreen #changes-box:focus { border-top: solid $accent; }
-    """
 
     def __init__(self, task: str) -> None:
         super().__init__()
@@ -130,7 +124,7 @@ class ReviewScreen(FleetScreen):
         if proposal is None:
             word = record.decision
             said = (
-                f"{'approved' if word.approved else 'rejected'} by {safe(word.by or 'somebody', 60)}"
+                f"{'approved' if word.approved else 'rejected'} by {safe(word.by or 'an operator', 60)}"
                 f"{f': {safe(word.why, 120)}' if word.why else ''}"
                 if word is not None
                 else told(record.failure) or "no plan of it waits"
@@ -152,7 +146,7 @@ class ReviewScreen(FleetScreen):
         elif self._checked != draft.plan:
             out.append("… not checked yet\n", "yellow")
         elif self._problems:
-            out.append("✘ it cannot run so\n", "red")
+            out.append("✘ invalid plan\n", "red")
             for problem in self._problems:
                 out.append(f"  · {safe(problem, 300)}\n", "red")
         else:
@@ -266,7 +260,7 @@ class ReviewScreen(FleetScreen):
             self._note = "the edited plan has not been checked yet: it is asked for"
             self._check(draft.plan)
         elif draft.changed and self._problems:
-            self._note = "it cannot run so: mend what is wrong, or take edits back"
+            self._note = "invalid plan: correct it, or undo edits"
         else:
             count = len(draft.subtasks)
             what = "the edited plan" if draft.changed else "the plan"
@@ -322,8 +316,8 @@ class ReviewScreen(FleetScreen):
             self._done(record, "rejected")
 
     def _told(self, error: SwiftbotError) -> None:
-        """Say what became of it; with two operators one was faster, and the other is told who."""
-        faster = "somebody was faster: " if isinstance(error, ConflictError) else ""
+        """Show the outcome; of two operators, the slower one sees who was faster."""
+        faster = "another operator was faster: " if isinstance(error, ConflictError) else ""
         self._note = f"{faster}{error.message} → {error.remedy or 'look at the task again'}"
         self.notify(safe(self._note), severity="error", markup=False)
         self.flush(force=True)

@@ -23,7 +23,7 @@ ROBOTS = (
     Column(title="mission", width=11, grow=True),
     Column(title="state", width=11, grow=True),
 )
-"""All that is to be told of a robot stands at 80 columns, beside a scroll bar."""
+"""All columns fit at 80 columns, beside a scroll bar."""
 _WIDE = 150
 """Columns from which the map stands beside the table."""
 
@@ -32,17 +32,8 @@ class RobotsScreen(FleetScreen):
     """All robots, and the map."""
 
     scope = "robots"
-    shows = ("robots", "tasks", "gateways", "enquiries", "stops")
+    shows = ("robots", "tasks", "gateways", "enquiries", "stops", "closures")
     BINDINGS = bindings("robots")
-    DEFAULT_CSS = """
-    RobotsScreen #parts { layout: vertical; height: 1fr; }
-    RobotsScreen #parts.wide { layout: horizontal; }
-    RobotsScreen #list { height: 1fr; }
-    RobotsScreen #selected { height: auto; max-height: 3; padding: 0 1; }
-    RobotsScreen #ground { height: 1fr; border-top: solid $foreground 30%; }
-    RobotsScreen #parts.wide #list { width: 3fr; height: 100%; }
-    RobotsScreen #parts.wide #ground { width: 2fr; height: 100%; border-top: none; border-left: solid $foreground 30%; }
-    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -108,12 +99,8 @@ class RobotScreen(FleetScreen):
 
     scope = "robot"
     tab = "robots"
-    shows = ("robots", "tasks", "gateways", "enquiries", "stops")
+    shows = ("robots", "tasks", "gateways", "enquiries", "stops", "closures")
     BINDINGS = bindings("robot")
-    DEFAULT_CSS = """
-    RobotScreen #about-box { height: 1fr; padding: 0 1; scrollbar-size: 1 1; }
-    RobotScreen #ground { height: 1fr; border-top: solid $foreground 30%; }
-    """
 
     def __init__(self, robot: str) -> None:
         super().__init__()

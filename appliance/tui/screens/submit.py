@@ -1,7 +1,7 @@
 """Takes an instruction, with history and completion of names, shows its plan, and submits exactly that plan.
 
 The history is the instructions that were submitted from this account: kept in a file, newest last, for the arrow keys.
-A file that cannot be read or written costs the history and nothing else: the cause is told once, as a sentence.
+A file that cannot be read or written costs the history and nothing else: the cause is shown once, as a sentence.
 Completed are robots, places and skills of this fleet, case ignored.
 """
 
@@ -9,7 +9,7 @@ import contextlib
 import os
 import tempfile
 import uuid
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -22,8 +22,8 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Label, Static
 
 from appliance.errors import PlanError, SwiftbotError
-from appliance.model import Approval, Site, TaskRecord, TaskRequest
-from appliance.tasks.api import PlanAnswer
+from appliance.model import Approval, RobotInfo, Site, TaskRecord, TaskRequest
+from appliance.model.task_api import PlanAnswer
 from appliance.tui import plan_editor
 from appliance.tui.actions import DIALOG_KEYS, key_name
 from appliance.tui.safe import safe
@@ -99,7 +99,7 @@ class History:
             with self.file.open("rb") as stream:
                 data = stream.read(MOST_BYTES + 1)
             if len(data) > MOST_BYTES:
-                self.problem = f"{self.file} is larger than {MOST_BYTES} bytes: the history begins anew"
+                self.problem = f"{self.file} is larger than {MOST_BYTES} bytes: the history starts empty"
                 return []
             return msgspec.json.decode(data, type=list[str])[-MOST:]
         except FileNotFoundError:
@@ -163,7 +163,12 @@ INSTRUCTION_LIMIT = 2000
 
 
 class InstructionInput(Field):
-    """The line: Tab completes, the arrows bring back earlier instructions."""
+    """The line: Tab completes, the arrows bring back earlier instructions; pasted lines are orders of their own."""
+
+    def joined(self, lines: Sequence[str]) -> str:
+        """Return pasted lines as one instruction, each an order that ends where its line does."""
+        ended = [line if line[-1] in ".,;!" else f"{line};" for line in lines]
+        return " ".join(ended).removesuffix(";")
 
     BINDINGS = [
         Binding("tab", "complete", show=False),
@@ -174,7 +179,7 @@ class InstructionInput(Field):
     def __init__(self, text: str, history: History, *, id: str) -> None:  # noqa: A002 - Textual's name
         super().__init__(
             text,
-            placeholder="e.g. drone_1: fly to the gate and take a picture",
+            placeholder="an order, such as ROBOT: go to PLACE",
             max_length=INSTRUCTION_LIMIT,
             select_on_focus=False,
             id=id,
@@ -238,6 +243,23 @@ def names_of(robots: Iterable[str], site: Site | None) -> tuple[str, ...]:
     return tuple(dict.fromkeys(found))
 
 
+def example(robots: Iterable[RobotInfo], site: Site | None) -> str:
+    """Return an instruction that this fleet can plan, to be shown before one is written.
+
+    Args:
+        robots: of the fleet.
+        site: its map; None while it is not known.
+    """
+    able = [each for each in robots if each.online and "goto" in each.verbs]
+    robot = min(able, key=lambda each: (each.flies, "camera" not in each.uses, each.id), default=None)
+    if robot is None or site is None or not site.places:
+        return "an order, such as ROBOT: go to PLACE"
+    thing = site.objects[0] if site.objects and "camera" in robot.uses and not robot.flies else None
+    place = thing.at if thing is not None else min(site.places)
+    go = f"e.g. {robot.id}: {'fly' if robot.flies else 'go'} to {place}"
+    return f"{go}, then photograph the {thing.name}" if thing is not None else go
+
+
 class SubmitDialog(ModalScreen[TaskRecord | None]):
     """Takes an instruction, shows its plan, and submits exactly that plan when it is confirmed."""
 
@@ -254,18 +276,20 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
         instruction: str = "",
         own: Mapping[str, str] | None = None,
         stops: Callable[[str], bool] = lambda _: False,
+        trains: Callable[[str], bool] = lambda _: False,
     ) -> None:
         """Make the dialog.
 
         Args:
             view: the fleet.
             history: earlier instructions.
-            instruction: what stands in it at first.
+            instruction: its first content.
             own: the operator's own keys.
             stops: carries a text out that is a soft stop; False when it is none.
+            trains: begins the run of federated learning that a text asks for; False when it asks for none.
         """
         super().__init__()
-        self._stops = stops
+        self._stops, self._trains = stops, trains
         key = (own or {}).get("edit-first", DIALOG_KEYS["edit-first"]).split(",")[0].strip()
         self._may = _REVIEW.format(key=key_name(key))
         self._view = view
@@ -281,7 +305,7 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
     def compose(self) -> ComposeResult:
         """Make the dialog."""
         with Vertical(classes="dialog"):
-            yield Label("What shall the robots do?", classes="title")
+            yield Label("Instruction", classes="title")
             yield InstructionInput(self._first, self._history, id="instruction")
             with Pane(id="plan-box"):
                 yield Static(id="plan")
@@ -292,6 +316,7 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
         field = self.query_one(InstructionInput)
         field.focus()
         field.names = names_of(sorted(self._view.store.robots), None)
+        field.placeholder = example(self._view.store.robots.values(), None)
         self._learn()
         if self._history.problem:
             self._show(Text(safe(self._history.problem), "yellow"), _ASK)
@@ -304,7 +329,9 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
         except SwiftbotError:
             return
         if self.is_mounted:
-            self.query_one(InstructionInput).names = names_of(sorted(self._view.store.robots), site)
+            field = self.query_one(InstructionInput)
+            field.names = names_of(sorted(self._view.store.robots), site)
+            field.placeholder = example(self._view.store.robots.values(), site)
 
     @on(Input.Changed, "#instruction")
     def edited(self, event: Input.Changed) -> None:
@@ -317,7 +344,7 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
     def entered(self, event: Input.Submitted) -> None:
         """Plan the instruction, or run the plan that is shown for it; a stop is carried out at once."""
         instruction = event.value.strip()
-        if self._stops(instruction):
+        if self._stops(instruction) or (not self._busy and self._trains(instruction)):
             self.action_leave()
         elif self._busy:
             pass

@@ -6,7 +6,7 @@ that come no more count as let go, and the lease ends at the gateways when it is
 Terminals tell of no release: a held key comes again and again, first after the keyboard's delay (a quarter to two
 thirds of a second), then some thirty times a second. So for `Holding` the key counts as held for a while after each,
 longer after the first, and everything that silences the terminal, a closed window, a cut link, a frozen machine, is a
-release as well. The lease itself is asked for anew only while keys come: an operator who is gone loses it. `Holding` is
+release as well. The lease itself is renewed only while keys come: an operator who is gone loses it. `Holding` is
 pure; the clock is passed in.
 """
 
@@ -20,13 +20,13 @@ from msgspec import Struct
 from rich.text import Text
 from textual import work
 from textual.app import ComposeResult
-from textual.binding import Binding
 from textual.widgets import Static
 
 from appliance.errors import ConflictError, SwiftbotError
 from appliance.model import Lease
 from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen
+from appliance.tui.part_keys import DRIVE, part_bindings
 from appliance.tui.robot_view import Ground, KnownRobots, place
 from appliance.tui.safe import safe
 from appliance.tui.store import Store
@@ -36,7 +36,7 @@ FIRST_S = 0.7
 NEXT_S = 0.25
 """The same for repeats: several of them, so that a jittery link does not make it stutter."""
 SEND_S = 0.2
-"""How often a movement is asked for anew; each lasts `LASTS_S` at the robot."""
+"""How often a movement is requested again; each lasts `LASTS_S` at the robot."""
 LASTS_S = 0.5
 """How long a robot goes on with a movement that is not asked for again: two lost messages."""
 IDLE_S = 30.0
@@ -127,7 +127,7 @@ SPEEDS = (0.1, 0.2, 0.5, 1.0, 1.5, 2.0)
 """Metres a second; the robot's own limit holds besides."""
 TURN_DPS = 30.0
 GIVE_BACK_S = 3.0
-"""How long leaving waits for the robot to be given back; beyond it the lease ends by itself."""
+"""How long leaving waits for the robot to be released; beyond it the lease ends by itself."""
 
 
 def velocity(move: str, speed_mps: float) -> dict[str, float]:
@@ -148,19 +148,7 @@ def velocity(move: str, speed_mps: float) -> dict[str, float]:
 class Pad(Static, can_focus=True):
     """Takes the keys; it has the focus as long as the screen is open."""
 
-    BINDINGS = [
-        Binding("up", "move('forward')", show=False),
-        Binding("down", "move('back')", show=False),
-        Binding("left", "move('turn left')", show=False),
-        Binding("right", "move('turn right')", show=False),
-        Binding("a", "move('left')", show=False),
-        Binding("d", "move('right')", show=False),
-        Binding("pageup", "move('up')", show=False),
-        Binding("pagedown", "move('down')", show=False),
-        Binding("space", "hold", show=False),
-        Binding("plus,equals_sign", "speed(1)", show=False),
-        Binding("minus", "speed(-1)", show=False),
-    ]
+    BINDINGS = part_bindings(DRIVE)
 
     def action_move(self, move: str) -> None:
         """Take a press or repeat of a direction."""
@@ -187,10 +175,6 @@ class TakeoverScreen(FleetScreen):
     tab = "robots"
     shows = ("robots", "tasks", "gateways", "enquiries", "stops")
     BINDINGS = bindings("takeover")
-    DEFAULT_CSS = """
-    TakeoverScreen #pad { height: auto; padding: 0 1; border-bottom: solid $foreground 30%; }
-    TakeoverScreen #ground { height: 1fr; }
-    """
 
     def __init__(self, robot: str, *, why: str = "") -> None:
         super().__init__()
@@ -236,7 +220,7 @@ class TakeoverScreen(FleetScreen):
         self._holding.touch(time.monotonic())
         self.flush(force=True)
 
-    def do_give_back(self, _given: object) -> None:
+    def do_release(self, _given: object) -> None:
         """Give it back and leave."""
         self.application.pop_screen()
 
@@ -244,7 +228,7 @@ class TakeoverScreen(FleetScreen):
 
     @work(exclusive=True, group="lease")
     async def _keep(self) -> None:
-        """Have the lease, as long as this screen is open and somebody is at the keys."""
+        """Have the lease, as long as this screen is open and keys come."""
         orders = self.view.orders
         try:
             lease = await orders.take_over(self.robot_id, why=self._why)

@@ -7,6 +7,7 @@ the selected subtask the reasons, the result and what its run says.
 import asyncio
 import contextlib
 from collections import deque
+from collections.abc import Mapping
 
 from rich.text import Text
 from textual import on, work
@@ -15,8 +16,8 @@ from textual.widgets import Static
 
 from appliance.errors import SwiftbotError
 from appliance.model import SubtaskState, TaskRecord
-from appliance.tasks.lines import Line
-from appliance.tasks.views import TaskWhy, why
+from appliance.model.task_api import Line, TasksAsk, TaskWhy
+from appliance.tasks.views import why
 from appliance.tui import status_styles, task_view
 from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen
@@ -34,7 +35,7 @@ SUBTASKS = (
     Column(title="state", width=15),
     Column(title="at", width=6, drop=1),
     Column(title="phase", width=11, drop=2),
-    Column(title="start", width=8, right=True, drop=3),
+    Column(title="startup", width=8, right=True, drop=3),
     Column(title="took", width=8, right=True, drop=4),
     Column(title="try", width=3, right=True, drop=5),
 )
@@ -42,6 +43,8 @@ ASK_S = 2.0
 """How often the coordinator is asked why something waits, while it is looked at."""
 LINES = 500
 """Lines of runs kept."""
+PAGE = 100
+"""Older tasks that are loaded at once."""
 SHOWN = 100
 """Lines of the selected subtask that are shown, the newest."""
 
@@ -66,12 +69,6 @@ class TaskScreen(FleetScreen):
     tab = "tasks"
     shows = ("tasks",)
     BINDINGS = bindings("task")
-    DEFAULT_CSS = """
-    TaskScreen #about { height: auto; max-height: 6; padding: 0 1; }
-    TaskScreen #subtasks { height: 2fr; min-height: 3; }
-    TaskScreen #detail-box { height: 3fr; border-top: solid $foreground 30%; scrollbar-size: 1 1; padding: 0 1; }
-    TaskScreen #detail-box:focus { border-top: solid $accent; }
-    """
 
     def __init__(self, task: str) -> None:
         super().__init__()
@@ -156,7 +153,7 @@ class TaskScreen(FleetScreen):
 
     def _about(self, record: TaskRecord) -> Text:
         out = Text.assemble(state_cell(record), f" · {safe(record.instruction, 400)}")
-        where = f"coordinated by {safe(record.coordinator, 63)}" if record.coordinator else "nobody coordinates it"
+        where = f"coordinated by {safe(record.coordinator, 63)}" if record.coordinator else "no coordinator"
         group = f", served by {safe(', '.join(record.group.members), 100)}" if record.group is not None else ""
         out.append(f"\n{where}{group}", "dim")
         if text := reason(record):
@@ -225,11 +222,6 @@ class TasksScreen(FleetScreen):
     scope = "tasks"
     shows = ("tasks",)
     BINDINGS = bindings("tasks")
-    DEFAULT_CSS = """
-    TasksScreen #tasks { height: 2fr; }
-    TasksScreen #detail-box { height: 3fr; border-top: solid $foreground 30%; scrollbar-size: 1 1; padding: 0 1; }
-    TasksScreen #detail-box:focus { border-top: solid $accent; }
-    """
 
     def body(self) -> ComposeResult:
         """Make the parts."""
@@ -251,6 +243,33 @@ class TasksScreen(FleetScreen):
         """Lay the plan out for the window."""
         if self.ready:
             self._draw_detail()
+
+    def do_older(self, _given: Mapping[str, str]) -> None:
+        """Load the next page of older tasks."""
+        if not self.view.steerable:
+            self.notify("a recorded log has the tasks of its time only", severity="warning")
+        else:
+            self._load_older()
+
+    @work(exclusive=True, group="older")
+    async def _load_older(self) -> None:
+        store = self.store
+        if len(store.tasks) + PAGE > store.tasks.most:
+            self.notify(
+                f"{len(store.tasks):,} tasks are loaded, as many as are kept\n→ `swiftbot task list --before TASK`",
+                severity="warning", markup=False,
+            )  # fmt: skip
+            return
+        oldest = store.tasks.get(store.newest[-1]) if store.newest else None
+        try:
+            page = await self.view.orders.tasks(PAGE, wanted=TasksAsk(remembered=True), after=oldest)
+        except SwiftbotError as error:
+            self.host.tell(error)
+            return
+        store.take_tasks(page.tasks)
+        lacks = f"; {', '.join(page.unreachable)} did not answer" if page.unreachable else ""
+        said = f"{len(page.tasks)} older tasks loaded" if page.tasks else "there are no older tasks"
+        self.notify(f"{said}{'; there are more' if page.more else ''}{safe(lacks)}", markup=False)
 
     @on(Grid.Moved)
     def _draw_detail(self) -> None:

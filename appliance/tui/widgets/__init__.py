@@ -10,7 +10,7 @@ one that does something here has a name under which it is given other keys (`act
 from collections.abc import Callable, Sequence
 
 from rich.text import Text
-from textual import on
+from textual import events, on
 from textual.app import ComposeResult
 from textual.binding import Binding
 from textual.containers import Vertical, VerticalScroll
@@ -18,6 +18,7 @@ from textual.message import Message
 from textual.widgets import Input, Static
 
 from appliance.tui.actions import line_bindings
+from appliance.tui.part_keys import PANE, part_bindings
 from appliance.tui.safe import clip
 
 
@@ -26,18 +27,24 @@ class Field(Input, inherit_bindings=False):
 
     BINDINGS = line_bindings()  # pyright: ignore[reportAssignmentType] - Textual wants a list of its own union
 
+    def joined(self, lines: Sequence[str]) -> str:
+        """Return lines that were pasted as one: Textual would keep the first of them alone."""
+        return " ".join(lines)
+
+    def _on_paste(self, event: events.Paste) -> None:
+        lines = [line.strip() for line in event.text.splitlines()]
+        text = self.joined([line for line in lines if line]) if len(lines) > 1 else event.text
+        event.stop()
+        event.prevent_default()
+        if text:
+            start, end = sorted(self.selection)
+            self.replace(text, start, end)
+
 
 class Pane(VerticalScroll, inherit_bindings=False):
     """A part of a screen that scrolls; without Textual's keys for scrolling sideways, which it has no use for."""
 
-    BINDINGS = [
-        Binding("up,k", "scroll_up", show=False),
-        Binding("down,j", "scroll_down", show=False),
-        Binding("home", "scroll_home", show=False),
-        Binding("end", "scroll_end", show=False),
-        Binding("pageup", "page_up", show=False),
-        Binding("pagedown", "page_down", show=False),
-    ]
+    BINDINGS = part_bindings(PANE)
 
 
 class Bar(Static):
@@ -119,14 +126,8 @@ class PromptInput(Field):
 class Prompt(Vertical):
     """The prompt of a screen; hidden while nothing is written and no filter is set."""
 
-    DEFAULT_CSS = """
-    Prompt { height: auto; display: none; }
-    Prompt #hints { height: auto; max-height: 2; color: $text-muted; padding: 0 1; }
-    Prompt Input { height: 1; border: none; padding: 0 1; background: $panel; }
-    """
-
     class Line(Message):
-        """Something about what stands there."""
+        """A note about the text."""
 
         def __init__(self, kind: str, text: str) -> None:
             super().__init__()
@@ -166,7 +167,7 @@ class Prompt(Vertical):
 
     @property
     def writing(self) -> bool:
-        """Whether somebody writes there."""
+        """Whether a person types there."""
         return self.display and self.field.has_focus
 
     def open(self, kind: str, text: str = "", note: str = "") -> None:

@@ -15,8 +15,9 @@ from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Label, Static
 
+from appliance.operations import Operation
 from appliance.tui import status_styles
-from appliance.tui.actions import ACTIONS, Action, key_name, keys_of
+from appliance.tui.actions import ACTIONS, key_name, keys_of
 from appliance.tui.safe import safe
 from appliance.tui.widgets import Pane
 
@@ -114,14 +115,14 @@ def help_text(scope: str, own: Mapping[str, str]) -> RenderableType:
     return Group(*parts, legend)
 
 
-def _table(found: list[Action], own: Mapping[str, str]) -> Table:
+def _table(found: list[Operation], own: Mapping[str, str]) -> Table:
     table = Table(box=None, pad_edge=False, show_header=False, expand=True)
     table.add_column(width=8, no_wrap=True)
     table.add_column(width=3, no_wrap=True)
     table.add_column(ratio=1)
     for action in found:
         keys = " ".join(key_name(key) for key in keys_of(action, own))
-        marks = f"{'!' if action.dangerous else ''}{'w' if action.writes else ''}"
+        marks = f"{'!' if action.dangerous else ''}{'w' if action.writes and not action.always else ''}"
         words = Text.assemble(action.help, "  ", (action.usage, "dim"))
         if action.screens:
             words.append(f"  on {', '.join(action.screens)}", "dim")

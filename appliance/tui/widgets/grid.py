@@ -13,19 +13,19 @@ from rich.cells import cell_len, set_cell_size
 from rich.segment import Segment
 from rich.style import Style
 from textual import events
-from textual.binding import Binding
 from textual.geometry import Region, Size
 from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from appliance.tui.formatting import Cell
+from appliance.tui.part_keys import GRID, part_bindings
 from appliance.tui.safe import clip
 
 Draw = Callable[[Any], Sequence[Cell]]
 
 _GUTTER = 2
-"""Cells on the left for the cursor's sign, so that the cursor is told by more than colour."""
+"""Cells on the left for the cursor's sign, so that the cursor is shown by more than colour."""
 _MUCH = 8
 """Cells left over, of which one is spared."""
 _KEPT = 400
@@ -54,21 +54,7 @@ class Grid(ScrollView, can_focus=True, inherit_bindings=False):
     """
 
     COMPONENT_CLASSES: ClassVar[set[str]] = {"grid--head", "grid--cursor"}
-    BINDINGS = [
-        Binding("up,k", "cursor(-1)", show=False),
-        Binding("down,j", "cursor(1)", show=False),
-        Binding("pageup", "page(-1)", show=False),
-        Binding("pagedown", "page(1)", show=False),
-        Binding("home,g", "edge(0)", show=False),
-        Binding("end,G", "edge(1)", show=False),
-        Binding("enter", "pick", show=False),
-    ]
-    DEFAULT_CSS = """
-    Grid { height: 1fr; scrollbar-size: 1 1; overflow-x: hidden; background: $background; color: $foreground; }
-    Grid .grid--head { color: $text-muted; text-style: bold; }
-    Grid .grid--cursor { background: $panel; }
-    Grid:focus .grid--cursor { background: $cursor; text-style: bold; }
-    """
+    BINDINGS = part_bindings(GRID)
 
     class About(Message):
         """Something about a row."""
@@ -159,7 +145,7 @@ class Grid(ScrollView, can_focus=True, inherit_bindings=False):
         return True
 
     def redraw(self) -> None:
-        """Draw all anew, as when what cells depend on besides their thing has changed."""
+        """Draw all again, as when something else that cells depend on has changed."""
         self._kept.clear()
         self.refresh()
 

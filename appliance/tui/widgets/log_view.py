@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.segment import Segment
 from rich.text import Text
 from textual.app import App
-from textual.binding import Binding
 from textual.geometry import Size
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from appliance.tui.command_line import Filter
+from appliance.tui.part_keys import LINES, part_bindings
 
 T = TypeVar("T")
 
@@ -101,20 +101,8 @@ class LineView(ScrollView, Generic[T], can_focus=True, inherit_bindings=False):
         empty: what is shown while there are none.
     """
 
-    BINDINGS = [
-        Binding("up,k", "move(-1)", show=False),
-        Binding("down,j", "move(1)", show=False),
-        Binding("pageup", "page(-1)", show=False),
-        Binding("pagedown", "page(1)", show=False),
-        Binding("home,g", "first", show=False),
-        Binding("end,G", "last", show=False),
-        Binding("left,h", "sideways(-1)", show=False),
-        Binding("right,l", "sideways(1)", show=False),
-    ]
+    BINDINGS = part_bindings(LINES)
     # No bar below: it would take a line of few, and what is cut is marked where it is.
-    DEFAULT_CSS = """
-    LineView { height: 1fr; scrollbar-size: 0 1; background: $background; color: $foreground; }
-    """
 
     def __init__(
         self,

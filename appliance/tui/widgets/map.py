@@ -108,7 +108,7 @@ MOST_M = 1e7
 MOST_NAMES = 100
 """Robots, or cells with several, that are named where there is room."""
 TOO_WIDE = 2.0
-"""So much wider than needed a view may be before it is made anew."""
+"""So much wider than needed a view may be before it is fitted again."""
 _ARROWS = "↑↗→↘↓↙←↖"
 _LABEL = 14
 
@@ -253,7 +253,7 @@ def draw(
 def _outline(canvas: Canvas, view: View, box: Area) -> None:
     style = "red" if box.forbidden else "dim"
     (left, bottom), (right, top) = view.dot(min(box.x), min(box.y)), view.dot(max(box.x), max(box.y))
-    # Forbidden areas are dotted, so that they are told from obstacles without colour.
+    # Forbidden areas are dotted, so that they differ from obstacles without colour.
     step = 2 if box.forbidden else 1
     for column in range(left, right + 1, step):
         canvas.dot(column, bottom, style)

@@ -1,6 +1,7 @@
 """The least that a robot's own program does to be one of a fleet: docs/robot-contract.md, in Python and eclipse-zenoh.
 
-    python minimal_robot.py FLEET NAME tcp/GATEWAY:7447
+    python minimal_robot.py FLEET NAME tcp/127.0.0.1:7447
+    python minimal_robot.py FLEET NAME tls/GATEWAY:7447 robot-NAME.pem authority.crt    # docs/security.md
 
 It drives in straight lines at 1 m/s and looks at nothing in its way; put your own base into `goto` and `hold`.
 """
@@ -141,10 +142,20 @@ class Robot:
 
 def main() -> None:
     """Run until it is ended."""
-    fleet, name, endpoint = sys.argv[1:]
+    fleet, name, endpoint, *files = sys.argv[1:]
     config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    settings: dict[str, Any] = {"mode": "client", "connect/endpoints": [endpoint]}
+    if files:
+        keys, authority = files
+        tls = {
+            "enable_mtls": True,
+            "connect_private_key": keys,
+            "connect_certificate": keys,
+            "root_ca_certificate": authority,
+        }
+        settings |= {f"transport/link/tls/{key}": value for key, value in tls.items()}
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
     with zenoh.open(config) as session:
         robot = Robot(session, fleet, name)
         while True:

@@ -122,7 +122,7 @@ async def watched(request: pytest.FixtureRequest, client: FleetClient) -> AsyncI
     begun = {each for app in WATCHED for each in app.begun}
     done = {each for app in WATCHED for each in app.done}
     for name in wanted:
-        assert name in (done if BY_NAME[name].do is not None else {action for action, _ in begun}), name
+        assert name in (done if not BY_NAME[name].call else {action for action, _ in begun}), name
     names = {app.view.operator for app in WATCHED}
     verbs = {AUDITED[name] for name in wanted if name in AUDITED}
     whys = {(AUDITED[name], why) for name, why in begun if name in wanted and why}

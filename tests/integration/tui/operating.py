@@ -8,6 +8,7 @@ import pytest
 from textual.pilot import Pilot
 
 from appliance.connection import FleetState
+from appliance.operations import OPERATIONS
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.command_line import Command
@@ -20,14 +21,7 @@ LONG_S = 60.0
 """Nothing that is waited for here takes so long; the machine may be busy."""
 
 
-AUDITED = {
-    "approve": "approve", "reject": "reject", "cancel": "cancel", "pause": "pause", "hold": "pause", "resume": "resume",
-    "retry": "retry", "retry-subtask": "retry", "migrate": "migrate", "answer": "answer", "takeover": "control_take",
-    "give-back": "control_give", "stop": "soft_stop", "stop-robot": "soft_stop", "resume-robots": "soft_resume",
-    "resume-all": "soft_resume", "drain": "drain", "undrain": "undrain", "swap-model": "llm_swap", "warm": "pool_warm",
-    "evict": "pool_evict", "release": "pool_release_quarantine", "fetch": "image_fetch",
-    "submit": "submit",
-}  # fmt: skip
+AUDITED = {operation.name: operation.audit for operation in OPERATIONS if operation.name and operation.audit}
 """As what the audit has each action of the registry that is an order."""
 
 T = TypeVar("T", bound=Callable[..., object])

@@ -7,11 +7,7 @@ import pytest
 from moving_bench import pretty
 
 from appliance.client import FleetClient
-from appliance.model import (
-    SubtaskState,
-    TaskRecord,
-    TaskState,
-)
+from appliance.model import SubtaskState, TaskRecord, TaskState
 from appliance.tui.screens.review import ReviewScreen
 from appliance.tui.widgets.dialogs import ConfirmDialog
 
@@ -69,7 +65,7 @@ async def confirm(ann: Operator, *words: str) -> None:
 async def proposed(ann: Operator, client: FleetClient, instruction: str = TOUR) -> TaskRecord:
     """Submit an instruction for review; its record once the plan waits and is looked at."""
     await ann.press("s")
-    await ann.see("What shall the robots do?")
+    await ann.see("Instruction")
     await ann.write(instruction)
     await ann.press("enter")
     await ann.see("Enter runs this plan")

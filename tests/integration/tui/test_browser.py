@@ -17,7 +17,7 @@ from PIL import Image
 from appliance.client import FleetClient
 from appliance.connection import FleetState
 
-pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
+pytestmark = [pytest.mark.anyio, pytest.mark.podman]
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from appliance.skills.catalogue import load_catalogue
 
 from .conftest import LAME
 
-pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
+pytestmark = [pytest.mark.anyio, pytest.mark.podman]
 
 ENDLESS = 4000
 """Steps of a run that is ended before it has made them."""
@@ -87,11 +87,11 @@ async def test_tasks(cora: Shell, client: FleetClient) -> None:
     assert (await cora("task", "resume", "c-count", "--why", "gone"))["paused"] is None
     run = await until_running(client, "c-count", "s1")
     (target,) = {"gw-1", "gw-2"} - {run.gateway}
-    moved = await cora("task", "migrate", "c-count", "s1", "--to", target, "--why", "to see")
+    moved = await cora("task", "migrate", "c-count/s1", "--to", target, "--why", "to see")
     assert (moved["moved"], moved["target"]) == (True, target)
     ended = await cora("task", "cancel", "c-count", "--why", "enough")
     assert (ended["state"], ended["cancelled_by"]["by"]) == ("cancelled", "cora")
-    again = await cora("task", "retry", "c-count", "s2", "--why", "one of them")
+    again = await cora("task", "retry", "c-count/s2", "--why", "one of them")
     assert again["retried_by"]["by"] == "cora"
     await until_running(client, "c-count", "s2")
     assert (await cora("task", "show", "c-count"))["state"] == "running"
@@ -134,19 +134,19 @@ async def test_robots(cora: Shell, client: FleetClient) -> None:
     assert {each["id"] for each in await cora("robots", "list")} == {"rover_1", "rover_2"}
     stopped = await cora("stop", "rover_1", "--why", "a person in the aisle")
     assert stopped["robots"] == ["rover_1"]
-    (stop,) = (await cora("standing"))["stops"]
+    (stop,) = (await cora("stops"))["stops"]
     assert (stop["robots"], stop["by"]) == (["rover_1"], "cora")
     assert not (await cora("resume", "rover_1", "--why", "gone")).get("stops")
-    lease = (await cora("robots", "take", "rover_1", "--lease", "60", "--why", "to look"))["id"]
-    assert "taken over by cora" in await cora("robots", "take", "rover_1", code=4)
+    lease = (await cora("robots", "takeover", "rover_1", "--lease", "60", "--why", "to look"))["id"]
+    assert "taken over by cora" in await cora("robots", "takeover", "rover_1", code=4)
     assert "pose" in await cora("robots", "move", "rover_1", "--lease", lease, "--forward", "0.3", "--for", "0.3")
     assert (await cora("robots", "renew", "rover_1", "--lease", lease))["robot"] == "rover_1"
-    assert (await cora("robots", "give", "rover_1", "--lease", lease, "--why", "seen"))["ended"]
+    assert (await cora("robots", "release", "rover_1", "--lease", lease, "--why", "seen"))["ended"]
     wait = Subtask(id="s1", skill="wait_for", robot="rover_1", params={"event": "the gate is open"})
     plan = Plan(domain="interaction", subtasks=(wait,))
     await client.submit(TaskRequest(instruction="wait", id="c-ask", plan=plan))
     async with asyncio.timeout(PATIENCE_S):
-        while not (asked := [each for each in await cora("asks") if each["task"] == "c-ask"]):
+        while not (asked := [each for each in await cora("questions") if each["task"] == "c-ask"]):
             await asyncio.sleep(0.1)
     await cora("answer", asked[0]["id"], "perhaps", code=4)
     assert (await cora("answer", asked[0]["id"], "yes", "--why", "I see it"))["answer"] == "yes"
@@ -161,7 +161,7 @@ async def test_gateways_and_pools(cora: Shell, client: FleetClient, broken: Call
     """Drained and undrained; containers warmed, listed, given up and decided on; an image fetched and released."""
     assert {each["id"] for each in await cora("fleet")} == {"gw-1", "gw-2"}
     assert (await cora("drain", "gw-1", "--why", "its fan is loud", "--wait"))["draining"]
-    assert not (await cora("undrain", "gw-1", "--why", "it was dust")).get("draining")
+    assert not (await cora("uncordon", "gw-1", "--why", "it was dust")).get("draining")
     warmed = await cora("pool", "warm", "base", "--count", "2", "--gateway", "gw-2", "--why", "a tour")
     assert warmed["ready"] >= 2
     assert {"gw-2"} <= {each["gateway"] for each in await cora("pool", "list")}
@@ -180,7 +180,7 @@ async def test_gateways_and_pools(cora: Shell, client: FleetClient, broken: Call
         client, ("drain", "its fan is loud"), ("undrain", "it was dust"), ("pool_warm", "a tour"),
         ("image_fetch", "to be sure"), ("pool_release_quarantine", "it is mended"),
     )  # fmt: skip
-    told = await cora("acts", "--limit", "500")
+    told = await cora("audit", "--limit", "500")
     assert {"drain", "pool_warm", "image_fetch"} <= {each["verb"] for each in told if each["by"] == "cora"}
 
 

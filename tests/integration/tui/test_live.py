@@ -27,12 +27,13 @@ from appliance.model import (
     TaskRequest,
     TaskState,
     encode,
+    keyspace,
 )
 from appliance.model.messages import enums_open
+from appliance.model.task_api import CancelTaskAsk, PlanAnswer, PlanAsk, TaskList, TasksAsk
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.tasks.api import CancelTaskAsk, PlanAnswer, PlanAsk, TaskList, TasksAsk
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.settings import TuiConfig
 from appliance.tui.subscriptions import FleetView
@@ -54,11 +55,11 @@ class Gateway:
         self.submitted: list[TaskRequest] = []
         self.cancelled: list[str] = []
         self._rpc = Rpc(session, name)
-        self._rpc.register("plan", PlanAsk, self._plan)
-        self._rpc.register("submit", TaskRequest, self._submit)
-        self._rpc.register("tasks", TasksAsk, self._tasks)
-        self._rpc.register("cancel", CancelTaskAsk, self._cancel)
-        self._token = session.declare_alive(self.keys.alive(name))
+        self._rpc.register(keyspace.PLAN, self._plan)
+        self._rpc.register(keyspace.SUBMIT, self._submit)
+        self._rpc.register(keyspace.TASKS, self._tasks)
+        self._rpc.register(keyspace.CANCEL, self._cancel)
+        self._token = session.declare_alive(self.session.keys(keyspace.GATEWAY_ALIVE, name))
         self._beat = asyncio.create_task(self._run())
 
     async def _plan(self, ask: PlanAsk) -> PlanAnswer:
@@ -69,7 +70,7 @@ class Gateway:
     async def _submit(self, request: TaskRequest) -> TaskRecord:
         self.submitted.append(request)
         record = TaskRecord(id=request.id, instruction=request.instruction, plan=request.plan, created_ns=2)
-        self.session.put(self.keys.task(request.id), encode(record))
+        self.session.publish(keyspace.TASK_UPDATE, record, request.id)
         return record
 
     async def _tasks(self, ask: TasksAsk) -> TaskList:
@@ -83,9 +84,9 @@ class Gateway:
         status = GatewayStatus(id=self.name, fleet="f1", load=0.25, containers=1, ready=1, limits_enforced=False)
         container = ContainerInfo(id="c-one", gateway=self.name, image="base", state=ContainerState.READY)
         while True:
-            self.session.put(self.keys.status(self.name), encode(status))
-            self.session.put(self.keys.container(self.name, "c-one"), encode(container))
-            self.session.put(self.keys.robot("r1"), encode(RobotInfo(id="r1", kind="zenoh")))
+            self.session.publish(keyspace.STATUS, status, self.name)
+            self.session.publish(keyspace.CONTAINER, container, self.name, "c-one")
+            self.session.publish(keyspace.ROBOT, RobotInfo(id="r1", kind="zenoh"), "r1")
             await asyncio.sleep(0.1)
 
     async def close(self) -> None:
@@ -161,7 +162,7 @@ async def test_task_from_instruction_to_end(gateway: Gateway, app: SwiftbotApp) 
             sequence=2,
             subtasks=(SubtaskRecord(subtask=PLAN.subtasks[0], state=SubtaskState.RUNNING, progress=0.25),),
         )
-        gateway.session.put(gateway.keys.task(request.id), encode(running))
+        gateway.session.publish(keyspace.TASK_UPDATE, running, request.id)
         await _see(app, pilot, "● s1 goto r1", "25%")
         await pilot.press("c", "y")
         await _see(app, pilot, "cancelling")
@@ -182,33 +183,34 @@ async def test_log_is_live(gateway: Gateway, app: SwiftbotApp) -> None:
     async with app.run_test(size=(80, 24)) as pilot:
         await _see(app, pilot, "gw-a")
         await pilot.press("7")
-        keys, session = gateway.keys, gateway.session
-        session.put(keys.log("gw-a"), b"\xff{")
-        session.put(keys.notice("ops"), b"[1, 2")
-        session.put(keys.log("gw-a"), encode(LogLine(at_ns=1, level="error", source="gw-a", event="container died")))
-        session.put(keys.notice("ops"), encode(Notice(id="n", to="ops", text="patrol over", at_ns=1)))
+        session = gateway.session
+        session.put(session.keys(keyspace.LOG, "gw-a"), b"\xff{")
+        session.put(session.keys(keyspace.NOTICE, "ops"), b"[1, 2")
+        session.publish(keyspace.LOG, LogLine(at_ns=1, level="error", source="gw-a", event="container died"), "gw-a")
+        session.publish(keyspace.NOTICE, Notice(id="n", to="ops", text="patrol over", at_ns=1), "ops")
         event = RunEvent(task="t", subtask="s1", attempt=1, kind=RunEventKind.STARTED, gateway="gw-a", startup_ms=2.5)
-        session.put(keys.run("t", "s1"), encode(event))
+        session.publish(keyspace.RUN_EVENT, event, "t", "s1")
         await _see(app, pilot, "container died", "patrol over", "t/s1 · started · start 2.5 ms")
 
 
 async def test_states_of_a_newer_version_are_shown(gateway: Gateway, app: SwiftbotApp) -> None:
     """A task and a container in states that only a newer gateway knows are on the screens with those states' words."""
-    keys, session = gateway.keys, gateway.session
+    session = gateway.session
     task = msgspec.json.decode(encode(TaskRecord(id="t-new", instruction="x", created_ns=9))) | {"state": "dreaming"}
     container = ContainerInfo(id="c-two", gateway=gateway.name, image="base", state=ContainerState.READY)
     asleep = msgspec.json.decode(encode(container)) | {"state": "hibernating", "depth_m": 3}
     with enums_open():
         async with app.run_test(size=(80, 24)) as pilot:
             await _see(app, pilot, "gw-a")
-            session.put(keys.task("t-new"), encode(task))
-            session.put(keys.container(gateway.name, "c-two"), encode(asleep))
+            session.publish(keyspace.TASK_UPDATE, task, "t-new")
+            session.publish(keyspace.CONTAINER, asleep, gateway.name, "c-two")
             await pilot.press("2")
             await _see(app, pilot, "t-new", "? dreaming")
             await pilot.press("4")
             await _see(app, pilot, "c-one", "c-two", "? hiberna")
 
 
+@pytest.mark.long
 async def test_lost_gateway_comes_back(app: SwiftbotApp, free_port: int) -> None:
     """Without a gateway the banner names cause and remedy; when one comes, and after it was lost, all is live."""
     async with app.run_test(size=(100, 24)) as pilot:

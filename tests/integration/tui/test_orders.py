@@ -8,14 +8,7 @@ from moving_bench import counting
 
 from appliance.client import FleetClient
 from appliance.connection import FleetState
-from appliance.model import (
-    Approval,
-    Plan,
-    Subtask,
-    SubtaskState,
-    TaskRequest,
-    TaskState,
-)
+from appliance.model import Approval, Plan, Subtask, SubtaskState, TaskRequest, TaskState
 from appliance.tui.screens.review import ReviewScreen
 from appliance.tui.screens.takeover import TakeoverScreen
 from appliance.tui.widgets.dialogs import ConfirmDialog
@@ -23,7 +16,7 @@ from appliance.tui.widgets.dialogs import ConfirmDialog
 from .operating import Operator, does, operator
 from .ordering import ENDLESS, confirm, final, proposed, record_of, running, select
 
-pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.usefixtures("watched")]
+pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.usefixtures("watched")]
 
 
 # --- tasks -------------------------------------------------------------------------------------------------------
@@ -33,7 +26,7 @@ pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.m
 async def test_submit(ann: Operator, client: FleetClient) -> None:
     """An instruction is planned, the plan is seen, and Enter runs exactly that one, in the operator's name."""
     await ann.line("submit rover_2: go to dock 1")
-    await ann.see("What shall the robots do?", "rover_2: go to dock 1")
+    await ann.see("Instruction", "rover_2: go to dock 1")
     await ann.press("enter")
     await ann.see("Enter runs this plan", "goto", "rover_2")
     known = set(ann.store.tasks)
@@ -73,8 +66,9 @@ async def test_approve_an_edited_plan(ann: Operator, client: FleetClient) -> Non
 
 
 @does("edit-up", "edit-down", "edit-after", "edit-undo", "edit-reload", "approve")
+@pytest.mark.long
 async def test_the_order_of_a_plan_is_edited(ann: Operator, client: FleetClient) -> None:
-    """What comes after what is changed, taken back and begun anew; each draft is checked, and the last one runs."""
+    """What comes after what is changed, taken back and begun again; each draft is checked, and the last one runs."""
     record = await proposed(ann, client, "rover_1: go to dock 3, then go to dock 2, then go to dock 1")
     steps = record.proposal.plan.subtasks if record.proposal is not None else ()
     assert [each.after for each in steps] == [(), ("s1",), ("s2",)]
@@ -123,6 +117,22 @@ async def test_reject(ann: Operator, client: FleetClient) -> None:
     assert all(not each.attempts for each in record.subtasks)
 
 
+@does("duplicate")
+async def test_duplicate(ann: Operator, client: FleetClient) -> None:
+    """What was done is done once more, as a task of its own, in the name of who asks for it; the first stays."""
+    await client.submit(TaskRequest(instruction="rover_2: go to dock 1", id="t-first", submitter="bob", priority=7))
+    assert (await record_of(client, "t-first", final)).state is TaskState.SUCCEEDED
+    await select(ann, "t-first")
+    known = set(ann.store.tasks)
+    await ann.press("D")
+    await confirm(ann, "once more")
+    await ann.until(lambda: set(ann.store.tasks) - known)
+    (task,) = set(ann.store.tasks) - known
+    record = await record_of(client, task, final)
+    assert record.state is TaskState.SUCCEEDED, record.failure
+    assert (record.instruction, record.submitter, record.priority) == ("rover_2: go to dock 1", "ann", 7)
+
+
 @does("pause", "hold", "resume")
 async def test_pause_hold_and_resume(ann: Operator, client: FleetClient) -> None:
     """Paused, nothing further begins; held, a run ends at its checkpoint; resumed, it goes on in a new attempt."""
@@ -160,13 +170,13 @@ async def test_cancel_and_retry(ann: Operator, client: FleetClient) -> None:
     assert record.cancelled_by.by == "ann"
     await ann.see("cancelled")
     await ann.press("t")
-    await confirm(ann, "Try task t-again again?")
+    await confirm(ann, "Retry task t-again?")
     await record_of(client, "t-again", running)
     await ann.line("cancel t-again one of them is enough")
     await confirm(ann, "Cancel task t-again?")
     await record_of(client, "t-again", final)
     await ann.line("retry-subtask t-again/s2 this one")
-    await confirm(ann, "Try t-again/s2 again?")
+    await confirm(ann, "Retry t-again/s2?")
     record = await record_of(client, "t-again", running)
     assert (record.retries, record.of("s2").state) == (2, SubtaskState.RUNNING)
     await client.cancel("t-again")
@@ -232,7 +242,7 @@ async def test_two_operators_one_winner(fleet: FleetState, client: FleetClient) 
         winner, loser = both if record.decision.by == "ann" else both[::-1]
         assert record.decision.by == winner.app.view.operator
         await winner.until(lambda: not isinstance(winner.app.screen, ReviewScreen))
-        await loser.see("somebody was faster", f"{record.decision.by} has approved")
+        await loser.see("another operator was faster", f"{record.decision.by} has approved")
         assert isinstance(loser.app.screen, ReviewScreen)
         ended = await record_of(client, "t-both", final)
         assert ended.state is TaskState.SUCCEEDED, ended.failure

@@ -12,12 +12,7 @@ from moving_bench import counting
 
 from appliance.client import FleetClient
 from appliance.connection import FleetState
-from appliance.model import (
-    ContainerState,
-    RobotInfo,
-    TaskRequest,
-    TaskState,
-)
+from appliance.model import Approval, ContainerState, RobotInfo, TaskRequest, TaskState
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
@@ -27,7 +22,7 @@ from .conftest import LAME
 from .operating import LONG_S, Operator, does
 from .ordering import TOUR, confirm, final, record_of
 
-pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet, pytest.mark.usefixtures("watched")]
+pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.usefixtures("watched")]
 
 
 # --- robots ------------------------------------------------------------------------------------------------------
@@ -38,7 +33,7 @@ def rover(client: FleetClient, name: str = "rover_1") -> RobotInfo:
     return client.plane.registry.robots[name]
 
 
-@does("takeover", "give-back")
+@does("takeover", "release-robot")
 async def test_take_over_and_give_back(ann: Operator, client: FleetClient) -> None:
     """While a key is held the robot moves, nobody else's order does, and given back it is anybody's again."""
     await ann.press("3", "home")
@@ -80,7 +75,7 @@ async def test_stop_and_resume_one_robot(ann: Operator, client: FleetClient) -> 
     (stop,) = (await client.standing()).active
     assert (stop.robots, stop.by, stop.why) == (("rover_2",), "ann", "a person in the aisle")
     await ann.line("resume-robots rover_2 gone")
-    await confirm(ann, "Lift the soft stop of rover_2?", "Why: gone")
+    await confirm(ann, "Lift the soft stop of rover_2?", "Reason: gone")
     await ann.hears("rover_2 may move again")
     assert not (await client.standing()).active
 
@@ -119,14 +114,14 @@ async def _stops(client: FleetClient, count: int) -> bool:
 # --- gateways and pools ------------------------------------------------------------------------------------------
 
 
-@does("drain", "undrain")
+@does("drain", "uncordon")
 async def test_drain_and_undrain(ann: Operator, client: FleetClient) -> None:
     """A drained gateway says so of itself and gets no run; undrained it is as before."""
     await ann.press("1", "home")
     await ann.until(lambda: ann.chosen.get("gateway") == "gw-1")
     await ann.until(lambda: ann.store.gateways["gw-1"].latency_ms is not None)
     await ann.line("drain gw-1 its fan is loud")
-    await confirm(ann, "Drain gw-1?", "its fan is loud")
+    await confirm(ann, "Drain gw-1?", "fan is loud")
     await ann.until(lambda: client.plane.registry.gateways["gw-1"].draining)
     await ann.see("◌ draining")
     await client.submit(counting("t-dry", steps=2))
@@ -155,11 +150,11 @@ async def test_warm_and_evict(ann: Operator, client: FleetClient) -> None:
     await ann.until(lambda: ann.chosen.get("gateway") == "gw-2" and ann.chosen["container"] in held())
     victim = ann.chosen["container"]
     await ann.press("e")
-    await confirm(ann, f"Give up {victim}?")
-    await ann.hears("1 given up")
+    await confirm(ann, f"Evict {victim}?")
+    await ann.hears("evicted")
     await ann.until(lambda: victim not in client.plane.registry.containers.get("gw-2", {}))
-    await ann.line("acts")
-    await ann.see("pool_evict", "pool_warm", "ann")
+    await ann.line("audit")
+    await ann.see("pool evict", "pool warm", "ann")
 
 
 @does("warm", "release", "evict")
@@ -173,12 +168,12 @@ async def test_quarantine_off(ann: Operator, client: FleetClient, broken: Callab
     await ann.hears("base is not in quarantine")
     await broken()
     await ann.line(f"release {LAME} gw-1 it is mended")
-    await ann.hears("gw-1: started again")
+    await ann.hears(f"gw-1: {LAME} released")
     await ann.line(f"warm {LAME} 1 gw-1")
     await ann.hears(f"gw-1: 1 of {LAME} ready")
     await ann.line(f"evict {LAME} gw-1")
-    await confirm(ann, f"Give up {LAME}?")
-    await ann.hears("1 given up")
+    await confirm(ann, f"Evict {LAME}?")
+    await ann.hears("evicted")
 
 
 @does("fetch")
@@ -208,3 +203,30 @@ async def test_swap_the_model(ann: Operator, client: FleetClient, toy: Path, tmp
         )
     )
     await ann.see("toy")
+
+
+# --- alerts ------------------------------------------------------------------------------------------------------
+
+
+@does("ack", "ack-all")
+async def test_acknowledge_alerts(ann: Operator, client: FleetClient) -> None:
+    """One by its key and the others after a question; who has done it, and why, is known to the whole fleet."""
+    for name in ("t-held-1", "t-held-2"):
+        await client.submit(
+            TaskRequest(instruction="rover_1: go to dock 2", id=name, approval=Approval.ALWAYS),
+        )
+    await ann.press("exclamation_mark")
+    await ann.until(lambda: {"plan-waits.t-held-1", "plan-waits.t-held-2"} <= set(ann.store.alerts))
+    await ann.line("ack plan-waits.t-held-1 a look at noon")
+    await ann.until(lambda: ann.store.acked("plan-waits.t-held-1"))
+    await ann.line("ack-all it is late")
+    await confirm(ann, "Acknowledge all alerts")
+    await ann.until(lambda: all(each.acked is not None for each in ann.store.alerts.values()))
+    words = {each.id: each.acked for each in (await client.alerts()).alerts}
+    first, second = words["plan-waits.t-held-1"], words["plan-waits.t-held-2"]
+    assert first is not None
+    assert second is not None
+    assert (first.by, first.why, second.why) == ("ann", "a look at noon", "it is late")
+    for name in ("t-held-1", "t-held-2"):
+        await client.cancel(name)
+    await ann.until(lambda: not {"plan-waits.t-held-1", "plan-waits.t-held-2"} & set(ann.store.alerts))

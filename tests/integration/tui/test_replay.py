@@ -16,7 +16,7 @@ from appliance.tui.widgets.dialogs import ConfirmDialog
 
 from .operating import LONG_S, Operator, operator
 
-pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
+pytestmark = [pytest.mark.anyio, pytest.mark.podman]
 
 
 def ended(folder: Path, task: str) -> bool:
@@ -74,7 +74,7 @@ async def test_a_recorded_log_drives_the_screens(fleet: FleetState) -> None:
             await ann.press("c")
             await ann.see("a recorded log cannot be steered")
             assert not isinstance(ann.app.screen, ConfirmDialog)
-            await ann.press("8", "g")
+            await ann.press("2", "J")
             await ann.write("0")
             await ann.press("enter")
             await ann.until(lambda: at_s(ann) == 0.0 and "t-past" not in ann.store.tasks)
@@ -89,7 +89,7 @@ async def test_a_recorded_log_drives_the_screens(fleet: FleetState) -> None:
             await ann.press("space")
             await ann.until(lambda: at_s(ann) > 0.5)
             await ann.press("space")
-            await ann.see("‖ paused")
+            await ann.see("RECORDED ‖")
             stood = at_s(ann)
             await ann.line("rate 100")
             await ann.see("100x")

@@ -84,7 +84,7 @@ async def no_children() -> None:
 
 
 async def test_nothing_without_the_token(served: Served) -> None:
-    """Page, files and socket are refused to whoever has no token, or comes from elsewhere; nothing is started."""
+    """Page, files and socket are refused without a token, or from elsewhere; nothing is started."""
     for path in ("/", "/static/js/textual.js", "/page.js", "/ws", "/nothing", "/?token=wrong-token-of-length"):
         status, text, headers = await served.get(path)
         assert status == 403, path
@@ -184,7 +184,7 @@ async def test_what_is_no_message_does_no_harm(served: Served) -> None:
 
 
 async def test_sessions_are_bounded(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """When so many browsers have it open, the next one is told so."""
+    """When so many browsers have it open, the next one sees that."""
     monkeypatch.setattr("appliance.tui.serve.SESSIONS", 0)
     status, text, _ = await served.get("/ws", **served.own)
     assert (status, SESSIONS) == (503, 8)

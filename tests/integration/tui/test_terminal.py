@@ -14,7 +14,7 @@ from appliance.connection import FleetState
 from appliance.model import SubtaskState, TaskState
 from appliance.pool.settings import PoolConfig
 
-pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.fleet]
+pytestmark = [pytest.mark.anyio, pytest.mark.podman]
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ async def test_main_path(fleet: FleetState, terminal: Terminal, tmp_path: Path) 
 
     # Submit: names are completed, the plan is shown, and it is edited before it runs.
     await terminal.press("s")
-    await terminal.see("What shall the robots do?")
+    await terminal.see("Instruction")
     await terminal.write("rover_1: go to doc")
     await terminal.press("Tab")
     await terminal.see("rover_1: go to dock ")

@@ -24,7 +24,7 @@ from appliance.skills.catalogue import Catalogue
     ],
 )
 def test_constraints_with_their_units(text: str, found: list[tuple[str, float | None, str]]) -> None:
-    """Deadlines, windows, periods, bounds and data sets, in the unit that is told; each piece of text once."""
+    """Deadlines, windows, periods, bounds and data sets, in the unit that is shown; each piece of text once."""
     assert [(each.kind, each.value, each.unit) for each in constraints(text)] == found
 
 

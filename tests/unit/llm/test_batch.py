@@ -1,4 +1,5 @@
-"""A file of instructions: every case has a line, nothing written is lost, and what is no case is told."""
+"""A file of instructions: every case has a line, nothing written is lost, and what is no case is reported."""
+# pyright: basic
 
 import json
 from pathlib import Path
@@ -46,6 +47,23 @@ async def test_every_case_gets_a_line(tmp_path: Path, catalogue: Catalogue) -> N
     assert "question" in found["b"]["why"]
     assert [each["robot"] for each in found["c"]["subtasks"]] == ["robot_1", "robot_2"]
     assert len(told) == 3
+
+
+async def test_a_run_of_federated_learning_is_refused_and_the_batch_goes_on(
+    tmp_path: Path, catalogue: Catalogue
+) -> None:
+    """Its line says what it is; the cases behind it get theirs."""
+    cases = written(
+        tmp_path / "cases.jsonl",
+        {"id": "a", "instruction": "train clips on all robots for 20 rounds", "robots": ["rover_1"]},
+        {"id": "b", "instruction": "rover_1: go to goal 2", "robots": ["rover_1"]},
+    )
+    await batch.run(cases, tmp_path / "out.jsonl", config=LlmConfig(), catalogue=catalogue, tier="rules")
+    first, second = rows(tmp_path / "out.jsonl")
+    assert (first["id"], first["decision"]) == ("a", "refuse")
+    assert "federated learning" in str(first)
+    assert second["id"] == "b"
+    assert second["decision"] == "run"
 
 
 async def test_an_interrupted_run_goes_on(tmp_path: Path, catalogue: Catalogue) -> None:

@@ -31,7 +31,7 @@ BAD = Plan(domain="navigation", subtasks=(Subtask(id="s1", skill="dance", robot=
 
 
 class FakeTier:
-    """A planner that does what it is told: a proposal, an error, or nothing for ever."""
+    """A planner that does what the test says: a proposal, an error, or nothing for ever."""
 
     def __init__(self, name: Tier, *answers: Proposal | Exception | None, repairs: bool = True) -> None:
         self.name = name
@@ -239,7 +239,7 @@ async def test_a_stop_reaches_no_planner(build: Build, instruction: str) -> None
 
 @pytest.mark.parametrize("tier", [Tier.LOCAL, Tier.PEER, Tier.UPSTREAM, Tier.RULES])
 async def test_what_the_words_forbid_runs_from_no_tier(build: Build, tier: Tier) -> None:
-    """The same review holds for each tier: a plan that does what the words forbid is refused, whoever made it."""
+    """The same review holds for each tier: a plan that does what the words forbid is refused from any of them."""
     with pytest.raises(PlanError, match="forbids this action"):
         await build(FakeTier(tier, sure(going(), 1.0), sure(going(), 1.0))).plan(
             PlanContext(instruction="do not go to dock 1")

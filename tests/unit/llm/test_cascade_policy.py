@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from appliance.errors import ConfigError, PlanError, RefusedError, UnreachableError
 from appliance.llm.cascade import Decomposer, Slot
-from appliance.llm.peers import PeerTier, ProposeAsk, Proposed, candidates
+from appliance.llm.peers import PeerTier, candidates
 from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.llm.tier import Proposal
 from appliance.model import (
@@ -26,6 +26,7 @@ from appliance.model import (
     Tier,
     plan_hash,
 )
+from appliance.model.planner_api import ProposeAsk, Proposed
 from appliance.skills.catalogue import Catalogue
 
 from .test_cascade import FakeTier, going, sure
@@ -150,7 +151,7 @@ async def test_an_unsure_plan_has_the_reason_why_it_should_wait(build: Build) ->
 
 
 async def test_the_policy_holds_for_every_tier_and_for_plans_handed_in(build: Build) -> None:
-    """A forbidden place is refused whoever plans it, and in a plan of somebody's own."""
+    """A forbidden place is refused from any planner, and in a plan of somebody's own."""
     safety = SafetyConfig(places_never=("dock 1",))
     cascade = build(FakeTier(Tier.LOCAL, sure(going()), sure(going())), safety=safety)
     with pytest.raises(PlanError, match="places_never"):

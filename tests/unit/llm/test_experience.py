@@ -279,7 +279,7 @@ class FakeStore:
 
 
 async def test_memory_survives_a_restart_and_damage() -> None:
-    """What was learned is there after a restart; a damaged value is learned anew, the others stand."""
+    """What was learned is there after a restart; a damaged value is learned again, the others stand."""
     store, kept = FakeStore(), memory()
     await kept.load(store)
     kept.learn(ended("a", failures=(DROPPED,)))

@@ -12,11 +12,11 @@ from appliance.llm.language import MAX_SUBTASKS, Answer, read, write
 from appliance.llm.words import MAX_WORDS, words_of
 from appliance.model import Subtask
 from appliance.skills.catalogue import load_catalogue
-from workshop import corpus
+from workshop.corpus import FOLDER
 from workshop.corpus.notation import parse
 
 CATALOGUE = load_catalogue()
-FILES = sorted(Path(corpus.__file__).parent.glob("*.plan"))
+FILES = sorted(FOLDER.glob("*.plan"))
 
 
 def test_a_plan_points_at_words() -> None:
@@ -37,7 +37,7 @@ def test_a_plan_points_at_words() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("file", FILES, ids=lambda each: each.stem)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_the_corpus_comes_back(file: Path) -> None:
     """What is written of every pair of the training corpus is read as the same plan, and its words suffice."""
     for pair in parse(file.read_text()).values():

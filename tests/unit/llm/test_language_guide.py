@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from appliance.llm.language import END, Answer, Guide, read, shapes, write
 from appliance.llm.words import between, words_of
 from appliance.skills.catalogue import load_catalogue
-from workshop import corpus
+from workshop.corpus import FOLDER
 from workshop.corpus.notation import parse
 
 CATALOGUE = load_catalogue()
 SKILLS = shapes(CATALOGUE)
-FILES = sorted(Path(corpus.__file__).parent.glob("*.plan"))
+FILES = sorted(FOLDER.glob("*.plan"))
 INSTRUCTIONS = (
     "Rex, fetch the drill from bay two and film it for half a minute.",
     "robots 1 and 2 meet at dock 3",
@@ -71,7 +71,7 @@ def test_a_range_has_all_between_its_ends_and_a_roster_still_decides() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("file", FILES, ids=lambda each: each.stem)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_the_corpus_follows_it(file: Path) -> None:
     """The plans of the corpus (each third) may be said, but those that need a literal that no range has."""
     for pair in list(parse(file.read_text()).values())[::3]:

@@ -123,7 +123,7 @@ async def test_of_plans_that_robots_cannot_do_the_one_that_is_meant_is_told() ->
 
 
 async def test_the_plan_there_is_outlives_a_second_look_that_fails() -> None:
-    """Late, a refusal, no plan at all: the likeliest of the first answers is what is told."""
+    """Late, a refusal, no plan at all: the likeliest of the first answers is what is reported."""
     for thorough in ([(REFUSED, 0.9)], [(UNREADABLE, 0.9)], DeadlineError("no answer within 1 s")):
         model = Model([(NOWHERE, 0.8)], thorough=thorough)
         assert (await proposed(model)).plan.subtasks[0].params == {}
@@ -152,3 +152,66 @@ async def test_a_refusal_is_no_plan() -> None:
     """Whatever else the model might have said, it found no order in the words."""
     with pytest.raises(PlanError, match="holds no order"):
         await asked((REFUSED, 0.9), (RIGHT, 0.1))
+
+
+class Wordings(Model):
+    """A model that answers each wording of an order in its own way; what it is asked is kept, words and roster."""
+
+    def __init__(self, answers: dict[str, tuple[list[str], float]]) -> None:
+        super().__init__([])
+        self._by_text = answers
+        self.heard: list[tuple[str, tuple[str, ...]]] = []
+
+    async def exchange(self, order: dict[str, Any]) -> dict[str, Any]:
+        """Answer."""
+        question = order["question"]
+        self.heard.append((question["text"], tuple(question["robots"])))
+        symbols, confidence = self._by_text[question["text"]]
+        return {"symbols": symbols, "confidence": confidence, "others": [], "tokens": 30, "ms": 5.0}
+
+
+ROVERS = tuple(replace(ROVER, id=f"rover_{number}") for number in range(1, 41))
+EVERYBODY = PlanContext(instruction="all rovers go to dock 3", robots=ROVERS)
+NAMED, TYPED = "rover_1 and rover_2 go to dock 3", "all rovers go to dock 3"
+BOTH_NAMED = [
+    "navigation",
+    *("goto", "w0", "w0", "place:", "w5", "w6"),
+    "|",
+    *("goto", "w2", "w2", "place:", "w5", "w6"),
+]
+BOTH_TYPED = [
+    "navigation",
+    *("goto", "w6", "w6", "place:", "w4", "w5"),
+    "|",
+    *("goto", "w7", "w7", "place:", "w4", "w5"),
+]
+IN_TURN = [*BOTH_TYPED, "<", "1"]
+
+
+async def test_what_two_of_a_group_do_is_given_to_all_of_it() -> None:
+    """Of forty rovers the model sees two, whichever way the order is worded; the plan is for forty."""
+    model = Wordings({NAMED: (BOTH_NAMED, 0.8), TYPED: (BOTH_TYPED, 0.6)})
+    proposal = await proposed(model, EVERYBODY)
+    assert {text for text, _ in model.heard} == {NAMED, TYPED}
+    assert {robots for _, robots in model.heard} == {("rover_1", "rover_2")}
+    assert [each.robot for each in proposal.plan.subtasks] == [each.id for each in ROVERS]
+    assert proposal.confidence == pytest.approx(0.8)
+    assert held(proposal, EVERYBODY) == ()
+
+
+@pytest.mark.parametrize(("named", "robots"), [(0.8, 2), (0.97, 40)])
+async def test_of_two_wordings_the_typed_one_counts_unless_the_other_is_far_surer(named: float, robots: int) -> None:
+    """A model errs in one where it is right in the other; what was said is what it was taught."""
+    model = Wordings({NAMED: (BOTH_NAMED, named), TYPED: (IN_TURN, 0.3)})
+    proposal = await proposed(model, EVERYBODY)
+    assert len(proposal.plan.subtasks) == robots
+    # One after the other is no plan for forty: it stays one for two, and a person sees it.
+    assert bool(held(proposal, EVERYBODY)) == (robots == 2)
+
+
+async def test_one_wording_is_enough() -> None:
+    """Where the model has no plan for one of them, the other's is taken; where for none, the reason is given."""
+    model = Wordings({NAMED: (REFUSED, 0.9), TYPED: (BOTH_TYPED, 0.6)})
+    assert len((await proposed(model, EVERYBODY)).plan.subtasks) == len(ROVERS)
+    with pytest.raises(PlanError, match="holds no order"):
+        await proposed(Wordings({NAMED: (REFUSED, 0.9), TYPED: (REFUSED, 0.9)}), EVERYBODY)

@@ -31,7 +31,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_a_process_that_cannot_be_started_is_said_and_tried_again(
     number: int, folder: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever asks meanwhile is told the machine's own words and what to look at, and is not left waiting."""
+    """A request meanwhile gets the machine's own words and what to look at, and does not wait."""
     tries: list[int] = []
 
     async def start(*_: Any, **__: Any) -> Any:
@@ -81,7 +81,7 @@ async def test_a_folder_that_is_no_models_is_said_at_once(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("broken", [OSError(errno.EIO, "Input/output error"), RuntimeError("the handler is closed")])
 async def test_a_pipe_that_breaks_is_an_error_of_the_model(broken: Exception, folder: str) -> None:
-    """Whatever the system says of the pipe, whoever asks hears that the model cannot be asked."""
+    """Whatever the system says of the pipe, the asker hears that the model cannot be asked."""
 
     class Pipe:
         def write(self, _: bytes) -> None:

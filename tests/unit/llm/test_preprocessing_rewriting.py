@@ -1,4 +1,4 @@
-"""What planners are told: names, points and the robots that the words can mean; the review goes by what was typed."""
+"""What planners get: names, points and the robots that the words can mean; the review goes by what was typed."""
 
 import pytest
 from msgspec.structs import replace
@@ -52,7 +52,7 @@ def test_a_point_is_told_as_a_place_and_comes_back_as_typed(text: str, point: st
     ],
 )
 def test_figures_that_are_no_point_stay(text: str) -> None:
-    """Numbers of places, texts to be spoken, and quantities are told as they are."""
+    """Numbers of places, texts to be spoken, and quantities are passed on as they are."""
     assert told(context(text)).points == {}
 
 
@@ -73,7 +73,7 @@ def test_only_robots_that_the_words_can_mean_are_told(text: str, robots: set[str
 
 
 def test_numbers_behind_a_kind_are_told_as_names() -> None:
-    """Of "Drones 1, 2 and 3" a planner is told the three names."""
+    """Of "Drones 1, 2 and 3" a planner gets the three names."""
     assert told(context("Drones 1, 2 and 3 take off")).instruction == "drone_1, drone_2 and drone_3 take off"
 
 

@@ -122,7 +122,7 @@ def test_the_breaker_never_stays_open_for_good(events: list[str]) -> None:
 
 
 def test_the_budget_counts_by_day() -> None:
-    """Requests and money are bounded a day, by prices; the next day begins anew, and a restart forgets nothing."""
+    """Requests and money are bounded a day, by prices; the next day begins again, and a restart forgets nothing."""
     budget = Budget(cost=1.0, requests=3, price_in=100_000, price_out=500_000)
     assert not budget.refuses("mon")
     budget.spend("mon", tokens_in=5, tokens_out=1)

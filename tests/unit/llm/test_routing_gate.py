@@ -1,4 +1,4 @@
-"""The planner's queue: bounded, fair, and clear to whoever finds it full."""
+"""The planner's queue: bounded, fair, and clear to those who find it full."""
 
 import asyncio
 

@@ -1,7 +1,8 @@
 """Stop words: which texts are a soft stop, of which robots, and which only look like one."""
 
 import string
-import time
+import sys
+from types import FrameType
 
 import pytest
 from hypothesis import given
@@ -94,6 +95,19 @@ Rover_1 go to dock 1; stop
 wait... stop
 No! Stop!
 go to the dock.STOP
+halt where you are
+all stations all stations halt now over
+I am terribly sorry to interrupt, but would you be so kind as to halt every robot this very instant
+for god's sake stop
+стоп
+стой!
+停止
+止まれ
+멈춰
+रुको
+ruk jao abhi
+قف
+dur
 alto
 ¡Alto!
 para
@@ -154,6 +168,8 @@ zatrzymajcie się natychmiast
 
 NAMED = {
     "rover_1 stop": ("rover_1",),
+    "for gods sake make rover_1 stop": ("rover_1",),
+    "rover two stop where you are man in the aisle": ("rover_2",),
     "Rover_1 stop": ("rover_1",),
     "Rover_1: stop!": ("rover_1",),
     "ROVER 1 STOP": ("rover_1",),
@@ -218,6 +234,10 @@ Rover_1 go to dock 1. Then stop.
 Rover_1 go to dock 1. And stop.
 Rover_1 go to dock 1. Stop there.
 Rover_1 go to dock 1 and stop there
+Rover_1 go to dock 1. Stop over there and photograph the shelf
+Rover_1 go to the gate. Stop over there please
+Go to dock 1. Stop there and photograph it
+Rover_1 go to dock 1. Stop there for 5 seconds
 go to the bus stop
 bus stop
 the bus stop
@@ -460,15 +480,28 @@ def test_what_is_a_stop_mentions_one(text: str) -> None:
     ],
 )
 def test_long_texts_take_linear_time(part: str) -> None:
-    """Long texts take linear time."""
+    """A text ten times as long takes no more than some ten times the calls, whatever stands in it."""
     roster = tuple(f"rover_{each}" for each in range(300))
-    text = (part * (100_000 // len(part) + 1))[:100_000]
+    text = (part * (20_000 // len(part) + 1))[:20_000]
     stop_request("stop", roster)
-    began = time.perf_counter()
-    stop_request(text[:10_000], roster)
-    tenth = time.perf_counter() - began
-    stop_request(text, roster)
-    assert time.perf_counter() - began - tenth < max(1.0, 40 * tenth)
+    assert calls_of(text, roster) <= 12 * calls_of(text[:2_000], roster) + 100
+
+
+def calls_of(text: str, roster: tuple[str, ...]) -> int:
+    """Count the calls of functions, methods and built-ins in one look for a stop."""
+    count = 0
+
+    def called(_frame: FrameType, event: str, _argument: object) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    before = sys.getprofile()
+    sys.setprofile(called)
+    try:
+        stop_request(text, roster)
+    finally:
+        sys.setprofile(before)
+    return count
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ _METRES = st.floats(-40, 40).map(lambda metres: round(metres, 3))
 def test_no_wall_is_so_thin_that_a_leg_gets_through(
     width: float, at: float, ends: tuple[float, float], across: tuple[float, float], upright: bool
 ) -> None:
-    """Whoever is on one side of a wall, wherever, and goes to the other side, at whatever angle, is stopped by it."""
+    """A robot on one side of a wall, wherever, that goes to the other side, at whatever angle, is stopped by it."""
 
     def turned(along: float, beside: float) -> tuple[float, float]:
         return (along, beside) if upright else (beside, along)

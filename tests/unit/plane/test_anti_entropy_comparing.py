@@ -6,9 +6,11 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.plane.anti_entropy import Compared, Comparing, DigestAsk, DigestList, FetchAsk, FetchList
+from appliance.model.keys import Verb
+from appliance.model.plane_api import DigestAsk, DigestList, FetchAsk, FetchList, Record
+from appliance.plane.anti_entropy import Compared, Comparing
+from appliance.plane.events import FleetEvents
 from appliance.plane.membership import Membership
-from appliance.plane.records import Record
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
 from appliance.plane.settings import PlaneConfig
@@ -26,13 +28,14 @@ class Bench:
         self.refused: list[str] = []
         self.asked: list[Any] = []
         self._tell, self._give = tell, give
-        membership = SimpleNamespace(members=RING.members, ring=RING, on_joined=[], on_lost=[])
+        membership = SimpleNamespace(members=RING.members, ring=RING)
         self.comparing = Comparing(
             PlaneConfig(),
             gateway="gw-1",
             store=cast("Store", self),
             rpc=cast("Rpc", self),
             membership=cast("Membership", membership),
+            events=FleetEvents(),
             keep=self.keep,
         )
 
@@ -52,13 +55,13 @@ class Bench:
         self.kept.append(record)
         return record
 
-    async def call(self, gateway: str, verb: str, ask: Any, reply: type[Any], *, timeout_s: float) -> Any:
+    async def call(self, gateway: str, verb: Verb[Any, Any], ask: Any, *, timeout_s: float) -> Any:
         """Ask gw-2."""
-        assert (gateway, reply) == ("gw-2", DigestList if verb == "dht_digest" else FetchList)
+        assert gateway == "gw-2"
         assert timeout_s > 0
         assert len(self.asked) < 50, "it never comes to an end"
         self.asked.append(ask)
-        return self._tell(ask) if verb == "dht_digest" else self._give(ask)
+        return self._tell(ask) if verb.name == "dht_digest" else self._give(ask)
 
 
 async def test_a_record_that_cannot_be_does_not_keep_the_others_out() -> None:

@@ -38,7 +38,7 @@ def test_nothing_new_nobody_asked(fleet: set[str], replicas: int, points: int) -
 @settings(deadline=None)
 @given(fleets, st.integers(1, 4), st.integers(1, 8))
 def test_sharing_is_mutual(fleet: set[str], replicas: int, points: int) -> None:
-    """Whoever holds copies of the same keys is found, by both."""
+    """Each gateway with copies of the same keys is found, by both."""
     ring = Ring(fleet | {"g0"}, virtual_nodes=points)
     for key in keys:
         holding = set(ring.successors(key, replicas))

@@ -1,15 +1,17 @@
 """What a gateway does at rest about members that it does not see any more."""
 
 import asyncio
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
+from appliance.model.keys import Verb
+from appliance.model.plane_api import DigestAsk
 from appliance.plane import anti_entropy
-from appliance.plane.anti_entropy import DigestAsk, Reconciler, Step, StepKind
+from appliance.plane.anti_entropy import Reconciler, Step, StepKind
 from appliance.plane.dht import Absence, Dht
+from appliance.plane.events import FleetEvents, Joined, Lost
 from appliance.plane.membership import Membership, StallDetector
 from appliance.plane.ring import Ring
 from appliance.plane.rpc import Rpc
@@ -28,11 +30,11 @@ class Bench:
         self.failures = 0
         self.done = asyncio.Event()
         self.refused: list[str] = []
-        self.on_ring_change: list[Callable[[], None]] = []
+        self.events = FleetEvents()
         config = PlaneConfig()
         self.absence = Absence(replicas=config.replicas)
-        self.settling = SimpleNamespace(returned=frozenset(), settled=self.settled)
-        self.membership = SimpleNamespace(members=RING.members, ring=RING, on_joined=[], on_lost=[])
+        self.settling = SimpleNamespace(returned=frozenset(), settled=self.settled, wanted=asyncio.Event())
+        self.membership = SimpleNamespace(members=RING.members, ring=RING)
         self.reconciler = Reconciler(
             config,
             gateway="gw-1",
@@ -40,7 +42,8 @@ class Bench:
             rpc=cast("Rpc", self),
             membership=cast("Membership", self.membership),
             dht=cast("Dht", self),
-            pulse=cast("StallDetector", SimpleNamespace(on_stalled=[], stalls=0)),
+            pulse=cast("StallDetector", SimpleNamespace(stalls=0)),
+            events=self.events,
         )
 
     def register(self, *_: object, **__: object) -> None:
@@ -68,19 +71,18 @@ class Bench:
     async def forget_tombstones(self, _: int) -> None:
         """Nothing is here."""
 
-    async def call(self, gateway: str, verb: str, ask: DigestAsk, reply: type[Any], **_: object) -> Any:
+    async def call(self, gateway: str, verb: Verb[Any, Any], ask: DigestAsk, **_: object) -> Any:
         """Answer that there is nothing."""
-        assert (verb, ask.asker) == ("dht_digest", "gw-1")
+        assert (verb.name, ask.asker) == ("dht_digest", "gw-1")
         self.asked.append(gateway)
-        return reply()
+        return verb.reply()
 
 
 async def test_those_that_were_lost_are_asked_whether_they_are_there() -> None:
     """A lost member may be there after all, on the other side of a cut that has healed."""
     bench = Bench()
     for name in ("gw-2", "gw-3"):
-        for lost in bench.membership.on_lost:
-            lost(name)
+        bench.events.publish(Lost(name))
     await bench.reconciler._round(Step(kind=StepKind.REST, ring=RING, stalls=0), tidy=False)
     assert sorted(bench.asked) == ["gw-2", "gw-3"]
 
@@ -99,8 +101,7 @@ async def test_what_goes_wrong_with_settling_ends_nothing(monkeypatch: pytest.Mo
     bench.failures = 1
     bench.membership.ring = bench.membership.ring.changed_to(frozenset({"gw-1", "gw-4"}))
     bench.membership.members = bench.membership.ring.members
-    for joined in bench.membership.on_joined:
-        joined("gw-4")
+    bench.events.publish(Joined("gw-4"))
     async with asyncio.timeout(60):
         await bench.done.wait()
     assert bench.refused == ["reconciling broke off"] * 4

@@ -1,4 +1,4 @@
-"""What a gateway compares next: losses before arrivals, whoever held what it gains is asked, and it comes to an end."""
+"""What a gateway compares next: losses before arrivals, then holders of what it gains, and it comes to an end."""
 
 from hypothesis import given
 from hypothesis import strategies as st

@@ -55,7 +55,7 @@ def test_a_key_is_in_doubt_exactly_while_all_its_holders_are_gone(gone: set[str]
 
 
 def test_a_doubt_outlasts_a_calm_and_those_who_come() -> None:
-    """The other side of a cut has its records, however long this one has settled without it and whoever joins it."""
+    """The other side of a cut has its records, however long this one has settled without it."""
     absence = calm(*NAMES)
     for name in NAMES[4:]:
         absence.lost(name, 0.0)
@@ -78,7 +78,7 @@ def test_a_doubt_outlasts_a_calm_and_those_who_come() -> None:
 
 
 def test_those_that_go_one_after_the_other_leave_no_doubt() -> None:
-    """A fleet that is made smaller step by step has its copies made anew each time."""
+    """A fleet that is made smaller step by step has its copies made again each time."""
     absence = calm(*NAMES)
     for left in range(7, 2, -1):
         absence.lost(NAMES[left], 60.0)

@@ -4,7 +4,7 @@ from appliance.plane.dht import Acknowledged
 
 
 def test_a_write_is_known_by_its_key_and_id() -> None:
-    """Under way, then acknowledged with its version; one that failed, or has no id, is looked at anew."""
+    """Under way, then acknowledged with its version; one that failed, or has no id, is looked at again."""
     known = Acknowledged()
     assert known.of("k", "w") == (False, None)
     known.note("k", "w", None)

@@ -33,11 +33,9 @@ def _settling() -> tuple[Settling, SimpleNamespace, SimpleNamespace]:
 async def test_a_request_waits_until_the_shard_is_compared() -> None:
     """It wants the comparison, and goes on once that is done; for another's key nobody is waited for again."""
     here, _, _ = _settling()
-    wanted: list[str] = []
-    here.on_wanted = lambda: wanted.append("wanted")
     waiting = asyncio.create_task(here.until_mine(MINE))
-    while not wanted:
-        await asyncio.sleep(0)
+    await here.wanted.wait()
+    here.wanted.clear()
     assert not here.reconciled()
     assert not waiting.done()
     await here.settled(RING, 0)
@@ -46,7 +44,7 @@ async def test_a_request_waits_until_the_shard_is_compared() -> None:
     assert here.mine(MINE)
     assert not here.mine(OTHERS)
     assert await here.until_mine(MINE)
-    assert wanted == ["wanted"]
+    assert not here.wanted.is_set()
 
 
 async def test_a_standstill_undoes_it() -> None:

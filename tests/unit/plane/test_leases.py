@@ -6,7 +6,8 @@ import random
 import pytest
 
 from appliance.errors import PayloadError, RefusedError
-from appliance.plane.leases import LONGEST_S, Granted, Grantor, LeaseAsk, LeaseEnd, granted, highest, holder_of
+from appliance.model.plane_api import LONGEST_S, Granted, LeaseAsk, LeaseEnd
+from appliance.plane.leases import Grantor, granted, highest, holder_of
 
 KEY = "reservation/aisle-3"
 GRANTORS = 3
@@ -24,7 +25,7 @@ def end(name: str, fence: int) -> LeaseEnd:
 
 
 class Fleet:
-    """Three grantors and three askers on a network that is cut anew all the time, driven by chance.
+    """Three grantors and three askers on a network that is cut again and again, driven by chance.
 
     An asker counts its lease from before it asked, as `leases` does, and asks under a fence above all it has heard of.
     """
@@ -164,7 +165,7 @@ def test_a_renewal_never_shortens_what_was_granted() -> None:
 
 
 def test_what_was_sent_before_a_grant_cannot_replace_it() -> None:
-    """A request or a release with an older fence does nothing, however late it comes and whoever has the key now."""
+    """A request or a release with an older fence does nothing, however late it comes and however the key has moved."""
     grantor = Grantor(fence=0, now=0.0)
     grantor.grant(ask("a", 1), 0.0)
     grantor.grant(ask("a", 2), 0.0)

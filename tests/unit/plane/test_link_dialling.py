@@ -24,7 +24,7 @@ def test_of_each_two_one_dials_the_other(gateways: set[str]) -> None:
 
 @given(names, names, st.booleans())
 def test_gossip_goes_by_the_same_order(one: str, other: str, names_both: bool) -> None:
-    """Whoever dials by the table has the greater session id, at each start anew; who only names others is above all."""
+    """Who dials by the table has the greater session id, at each start; one that only names others is above all."""
     table = {one: "tcp/a:1", other: "tcp/b:1"}
     if rank(one) != rank(other):
         first, second = session_id(one, naming=False), session_id(other, naming=False)

@@ -70,7 +70,7 @@ async def test_sessions_share_a_watch() -> None:
 
 
 def test_ends_are_read_from_locators() -> None:
-    """IPv4, IPv6 and IPv4 in IPv6 are told as sockets tell them; what is no address is none."""
+    """IPv4, IPv6 and IPv4 in IPv6 are written as sockets write them; what is no address is none."""
     assert address_of("tcp/127.0.0.1:7447") == ("127.0.0.1", 7447)
     assert address_of("tls/127.0.0.1:7447?rel=1#iface=lo") == ("127.0.0.1", 7447)
     assert address_of("tcp/[::1]:80") == ("::1", 80)

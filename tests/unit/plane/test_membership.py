@@ -5,7 +5,9 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from appliance.plane.keys import Keys
+from appliance.model import keyspace
+from appliance.model.keys import Keys
+from appliance.plane.events import FleetEvents
 from appliance.plane.membership import Membership
 from appliance.plane.ring import Ring
 from appliance.plane.session import Session
@@ -15,8 +17,8 @@ KEYS = Keys("fleet")
 
 def membership() -> Membership:
     """One of gw-1 that has seen gw-2."""
-    made = Membership(cast("Session", MagicMock(keys=KEYS)), gateway="gw-1", virtual_nodes=4)
-    made.add("gw-2")
+    made = Membership(cast("Session", MagicMock(keys=KEYS)), gateway="gw-1", virtual_nodes=4, events=FleetEvents())
+    made.add(KEYS(keyspace.GATEWAY_ALIVE, "gw-2"))
     return made
 
 
@@ -26,7 +28,7 @@ def membership() -> Membership:
 def test_news_while_the_ring_is_made_elsewhere_is_kept(
     monkeypatch: pytest.MonkeyPatch, name: str, alive: bool, then: set[str]
 ) -> None:
-    """Whoever comes or goes while another thread makes the ring is there, or gone, when that is done."""
+    """A member that comes or goes while another thread makes the ring is there, or gone, when that is done."""
     here = membership()
     change, news = Ring.changed_to, [(name, alive)]
 
@@ -34,7 +36,7 @@ def test_news_while_the_ring_is_made_elsewhere_is_kept(
         made = change(ring, members)
         if news:  # the event loop hears of it just now
             said, is_there = news.pop()
-            here._seen(KEYS.alive(said), alive=is_there)
+            here._seen(KEYS(keyspace.GATEWAY_ALIVE, said), alive=is_there)
         return made
 
     monkeypatch.setattr(Ring, "changed_to", slowly)
@@ -44,9 +46,9 @@ def test_news_while_the_ring_is_made_elsewhere_is_kept(
 
 
 def test_one_that_was_lost_while_the_ring_was_made_can_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its token is counted anew, as of somebody who was not there."""
+    """Its token is counted from one, as of somebody who was not there."""
     here = membership()
-    change, lost = Ring.changed_to, [KEYS.alive("gw-2")]
+    change, lost = Ring.changed_to, [KEYS(keyspace.GATEWAY_ALIVE, "gw-2")]
 
     def slowly(ring: Ring, members: frozenset[str]) -> Ring:
         made = change(ring, members)
@@ -56,7 +58,7 @@ def test_one_that_was_lost_while_the_ring_was_made_can_come_back(monkeypatch: py
 
     monkeypatch.setattr(Ring, "changed_to", slowly)
     assert here.ring.members
-    here._seen(KEYS.alive("gw-2"), alive=True)
+    here._seen(KEYS(keyspace.GATEWAY_ALIVE, "gw-2"), alive=True)
     assert here.members == {"gw-1", "gw-2"}
     assert here.ring.members == {"gw-1", "gw-2"}
 
@@ -65,3 +67,14 @@ def test_the_ring_is_made_once_for_the_same_members() -> None:
     """Who asks again gets the same ring, without a comparison of members."""
     here = membership()
     assert here.ring is here.ring
+
+
+@pytest.mark.parametrize("below", ["**", "*/alive", "a\nb/alive", "x$*/alive"])
+def test_a_token_whose_key_names_no_gateway_is_refused(below: str) -> None:
+    """A stranger's token keeps no process from joining, and makes no member."""
+    here = membership()
+    key = f"swiftbot/fleet/gw/{below}"
+    here.add(key)
+    here._seen(key, alive=False)
+    assert here.members == {"gw-1", "gw-2"}
+    assert cast("MagicMock", here._session).refuse.call_count == 1

@@ -16,7 +16,7 @@ def status(of: tuple[int, int]) -> GatewayStatus:
 
 @given(st.lists(processes, min_size=1, max_size=4, unique=True), st.integers(1, 40))
 def test_each_hears_of_the_others_and_all_but_one_go(them: list[tuple[int, int]], times: int) -> None:
-    """Each hears all, itself too: whoever has others suspects so after a while; just one of them stays."""
+    """Each hears all, itself too: one that has namesakes suspects so after a while; just one of them stays."""
     sides = {each: Suspicion() for each in them}
     suspects = dict.fromkeys(them, False)
     for number in range(times):

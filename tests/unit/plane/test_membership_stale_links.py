@@ -1,4 +1,4 @@
-"""Members that were never lost though this process stood still: links are made anew, by nobody's word."""
+"""Members that were never lost though this process stood still: links are made again, by nobody's word."""
 
 import asyncio
 from collections.abc import Callable
@@ -6,18 +6,12 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.model import keyspace
+from appliance.model.keys import Keys
 from appliance.plane.anti_entropy import COMPARE_S, LOSS_S, SEE_S
 from appliance.plane.dht import RETURNED_S
-from appliance.plane.keys import Keys
-from appliance.plane.membership import (
-    MOST_ASKED,
-    RELINK_REST_S,
-    RELINK_TRIES,
-    Membership,
-    Outlived,
-    Stall,
-    StallDetector,
-)
+from appliance.plane.events import FleetEvents, Stall, Stalled
+from appliance.plane.membership import MOST_ASKED, RELINK_REST_S, RELINK_TRIES, Membership, Outlived
 from appliance.plane.settings import PlaneConfig
 
 pytestmark = pytest.mark.anyio
@@ -28,7 +22,7 @@ class Bench:
     """A pulse and a membership in the test's hands; `after` happens in each pause."""
 
     def __init__(self, *tokens: tuple[str, float]) -> None:
-        self.on_stalled: list[Callable[[Stall], None]] = []
+        self.events = FleetEvents()
         self.tokens = dict(tokens)
         self.answering: set[str] = set()
         self.gone: dict[str, float] = {}
@@ -38,13 +32,13 @@ class Bench:
         self.asked: list[str] = []
         self.renewed: list[str] = []
         self.heals = True
-        """Whether links that were made anew are right."""
+        """Whether links that were made again are right."""
         self.pauses: list[float] = []
         self.after: list[Callable[[], None]] = []
         self.now = 0.0
         self.done = asyncio.Event()
         self.outlived = Outlived(
-            cast("StallDetector", self),
+            self.events,
             lease_s=LEASE_S,
             members=self,
             answers=self.answers,
@@ -63,7 +57,7 @@ class Bench:
         return frozenset(name for name, at in self.gone.items() if at >= moment)
 
     def renew(self, why: str) -> None:
-        """Links are made anew."""
+        """Links are made again."""
         self.renewed.append(why)
         if self.heals:
             self.answering |= self.tokens.keys()
@@ -95,8 +89,7 @@ class Bench:
     async def stand_still(self, since: float, lasted_s: float) -> None:
         """Stand still, and wait until all is looked at."""
         self.now = since + lasted_s
-        for tell in tuple(self.on_stalled):
-            tell(Stall(since, lasted_s))
+        self.events.publish(Stalled(Stall(since, lasted_s)))
         others = asyncio.all_tasks() - {cast("Any", asyncio.current_task())}
         await asyncio.gather(*(each for each in others if each.get_name() == "links after a standstill"))
 
@@ -114,7 +107,7 @@ class FakeSession:
 
     def tell(self, name: str, number: str = "", *, alive: bool = True) -> None:
         """A token is seen, or gone."""
-        self.watching[0](f"{self.keys.alive(name)}{number}", alive)
+        self.watching[0](f"{self.keys(keyspace.GATEWAY_ALIVE, name)}{number}", alive)
 
 
 async def test_links_are_made_anew_for_one_that_was_never_lost_and_is_silent() -> None:
@@ -153,11 +146,11 @@ async def test_one_that_answers_or_has_gone_meanwhile_is_well() -> None:
         bench.tokens.pop("gw-4", None)
         return await asked(name, timeout_s)
 
+    await bench.outlived.close()
     bench.outlived = Outlived(
-        cast("StallDetector", bench), lease_s=LEASE_S, members=bench, answers=gone, sees=bench.sees, renew=bench.renew,
+        bench.events, lease_s=LEASE_S, members=bench, answers=gone, sees=bench.sees, renew=bench.renew,
         now=lambda: bench.now, pause=bench.pause,
     )  # fmt: skip
-    bench.on_stalled = bench.on_stalled[1:]
     await bench.stand_still(10.0, 1.1)
     assert (bench.asked, bench.renewed) == (["gw-3", "gw-4"], [])
 
@@ -172,17 +165,17 @@ async def test_a_look_that_is_under_way_is_not_begun_again() -> None:
         await goes_on.wait()
         return await bench.answers(name, timeout_s)
 
+    await bench.outlived.close()
     outlived = Outlived(
-        cast("StallDetector", bench), lease_s=LEASE_S, members=bench, answers=slow, sees=bench.sees, renew=bench.renew,
+        bench.events, lease_s=LEASE_S, members=bench, answers=slow, sees=bench.sees, renew=bench.renew,
         now=lambda: bench.now, pause=bench.pause,
     )  # fmt: skip
-    tell = bench.on_stalled[-1]
     bench.now = 20.0
-    tell(Stall(10.0, 1.1))
+    bench.events.publish(Stalled(Stall(10.0, 1.1)))
     await asked.wait()
     asked.clear()
     bench.now = 20.0 + 2 * RELINK_REST_S
-    tell(Stall(bench.now, 1.1))
+    bench.events.publish(Stalled(Stall(bench.now, 1.1)))
     goes_on.set()
     await asyncio.gather(*(each for each in asyncio.all_tasks() if each.get_name() == "links after a standstill"))
     assert (len(bench.asked), len(bench.renewed)) == (2, 1)
@@ -223,7 +216,7 @@ async def test_it_is_not_done_again_at_once() -> None:
 
 
 async def test_one_that_does_not_come_back_is_dialled_through_the_others() -> None:
-    """It was lost in the standstill and others see it: links are made anew; one that nobody sees is gone."""
+    """It was lost in the standstill and others see it: links are made again; one that nobody sees is gone."""
     bench = Bench(("gw-2", 11.05), ("gw-3", 11.05))
     bench.answering = {"gw-2", "gw-3"}
     bench.gone = {"gw-4": 11.1, "gw-5": 11.1, "gw-6": 3.0}
@@ -264,7 +257,7 @@ def test_membership_knows_since_when_a_token_was_seen(monkeypatch: pytest.Monkey
     monkeypatch.setattr("appliance.plane.membership.clock", lambda: now)
 
     session = FakeSession()
-    membership = Membership(cast("Any", session), gateway="gw-1", virtual_nodes=1)
+    membership = Membership(cast("Any", session), gateway="gw-1", virtual_nodes=1, events=FleetEvents())
     membership.start()
     session.tell("gw-2")
     session.tell("gw-3")

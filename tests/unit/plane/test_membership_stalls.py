@@ -4,7 +4,8 @@ import asyncio
 
 import pytest
 
-from appliance.plane.membership import Stall, StallDetector
+from appliance.plane.events import FleetEvent, FleetEvents, Stage, Stall, Stalled
+from appliance.plane.membership import StallDetector
 
 pytestmark = pytest.mark.anyio
 
@@ -23,8 +24,9 @@ class Clock:
 async def test_standing_still_is_noticed_by_whoever_looks_first() -> None:
     """Three quarters of a lease without a beat put a gateway in doubt for a lease, and its listeners hear of it."""
     clock, told = Clock(), asyncio.Event()
-    pulse = StallDetector(1.0, clock=clock)
-    pulse.on_stalled.append(lambda _: told.set())
+    events = FleetEvents()
+    pulse = StallDetector(1.0, events=events, clock=clock)
+    events.subscribe(Stage.WATCHERS, lambda _: told.set())
     pulse.start()
     try:
         for _ in range(8):
@@ -47,15 +49,16 @@ async def test_standing_still_is_noticed_by_whoever_looks_first() -> None:
 async def test_each_standstill_is_told_as_what_it_was() -> None:
     """A second, shorter one before the event loop gets its turn does not hide the first."""
     clock, both = Clock(), asyncio.Event()
-    told: list[Stall] = []
+    told: list[FleetEvent] = []
 
-    def take(standstill: Stall) -> None:
-        told.append(standstill)
+    def take(event: FleetEvent) -> None:
+        told.append(event)
         if len(told) == 2:
             both.set()
 
-    pulse = StallDetector(1.0, clock=clock)
-    pulse.on_stalled.append(take)
+    events = FleetEvents()
+    pulse = StallDetector(1.0, events=events, clock=clock)
+    events.subscribe(Stage.WATCHERS, take)
     pulse.start()
     try:
         for seconds in (5.0, 0.75):
@@ -64,13 +67,13 @@ async def test_each_standstill_is_told_as_what_it_was() -> None:
         await both.wait()
     finally:
         pulse.close()
-    assert told == [(100.0, 5.0), (105.0, 0.75)]
+    assert told == [Stalled(Stall(100.0, 5.0)), Stalled(Stall(105.0, 0.75))]
 
 
 async def test_time_before_the_start_and_after_the_end_counts_for_nothing() -> None:
     """A gateway that is still opening or already closed did not stand still."""
     clock = Clock()
-    pulse = StallDetector(1.0, clock=clock)
+    pulse = StallDetector(1.0, events=FleetEvents(), clock=clock)
     clock.now += 60
     assert not pulse.doubtful
     pulse.start()
@@ -88,7 +91,7 @@ async def test_the_pulse_beats_while_the_loop_is_held_up() -> None:
         beats.append(0.0)
         return 0.0
 
-    pulse = StallDetector(0.01, clock=clock)
+    pulse = StallDetector(0.01, events=FleetEvents(), clock=clock)
     pulse.start()
     try:
         while len(beats) < 10:  # the loop gets no turn

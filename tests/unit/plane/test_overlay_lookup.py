@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from appliance.plane.overlay import MOST_ASKED, Around, Lookup, Step, View, bound_for
 from appliance.plane.ring import RING_SIZE, Ring, point
-from workshop.bench.dht.fleet import Fleet
+from workshop.bench.dht.simulation import Fleet
 
 fleets = st.sets(st.from_regex(r"[a-z][a-z0-9]{0,4}", fullmatch=True), min_size=1, max_size=60)
 positions = st.integers(0, RING_SIZE - 1)
@@ -53,7 +53,7 @@ def test_a_lookup_ends_at_the_owner(names: set[str], target: int, rng: random.Ra
 @settings(max_examples=60, deadline=None)
 @given(fleets, positions, st.integers(1, 70))
 def test_the_nearest_known_come_before_a_position(names: set[str], target: int, most: int) -> None:
-    """As many as are asked for, by their distance on to the position; whoever stands at it is the first."""
+    """As many as are asked for, by their distance on to the position; the one that stands at it is the first."""
     me, *others = sorted(names)
     view = View(me, bound=100)
     view.hear(others)

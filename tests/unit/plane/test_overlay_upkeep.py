@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from appliance.plane.overlay import Around, Meet, MeetAsk, Pace, Seek, Upkeep, View, bound_for, successor_count
 from appliance.plane.ring import Ring
-from workshop.bench.dht.fleet import Fleet
+from workshop.bench.dht.simulation import Fleet
 
 
 def check_neighbours(fleet: Fleet) -> None:

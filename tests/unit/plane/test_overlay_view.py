@@ -1,4 +1,4 @@
-"""What a bounded view keeps: whoever is known and as good as others stays."""
+"""What a bounded view keeps: one that is known and as good as others stays."""
 
 import random
 
@@ -35,7 +35,7 @@ def test_what_is_heard_of_others_replaces_nobody_as_good(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_place_of_one_that_is_gone_is_taken(seed: int) -> None:
-    """By somebody who is heard of then, whoever it was."""
+    """By somebody who is heard of then."""
     view, others = settled(seed)
     rng = random.Random(seed)  # noqa: S311
     full = len(view)

@@ -7,11 +7,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, PayloadError
+from appliance.model.plane_api import Record, Write
 from appliance.plane.records import (
     MAX_KEY,
     Behind,
-    Record,
-    Write,
     by_bytes,
     check_key,
     check_record,
@@ -164,7 +163,7 @@ def test_summaries_tell_shards_apart(one: dict[str, str], other: dict[str, str])
 
 
 def test_records_that_are_alike_do_not_cancel_out() -> None:
-    """An even number of records that are alike but for their key is told apart from as many older ones."""
+    """An even number of records that are alike but for their key is distinguished from as many older ones."""
     old, new = Record(key="k", value=b"old", version={"a": 1}), Record(key="k", value=b"new", version={"a": 1, "b": 1})
     keys = [f"task/{n}" for n in range(4)]
     assert summary(dict.fromkeys(keys, digest(old))) != summary(dict.fromkeys(keys, digest(new)))

@@ -1,4 +1,4 @@
-"""How often things are told: at once after quiet, never too often, never too late, sooner what is asked for."""
+"""How often things are published: at once after quiet, never too often, never too late, sooner what is asked for."""
 
 from itertools import pairwise
 
@@ -46,7 +46,7 @@ def test_the_interval_costs_least() -> None:
 @settings(deadline=None)
 @given(st.lists(st.floats(0.001, 3), max_size=60), st.floats(0, 50), st.integers(0, 300))
 def test_every_change_is_told_in_time_and_messages_stay_apart(gaps: list[float], elsewhere: float, others: int) -> None:
-    """Whatever changes is told within the bounds, what waits is told together, and two messages are never too close."""
+    """Changes are published within the bounds, those that wait together, and two messages are never too close."""
     least, most = bounds(others, least_s=LEAST, most_s=MOST)
     cadence = Cadence(least_s=LEAST, most_s=MOST)
     told: list[float] = []

@@ -1,12 +1,13 @@
 """Own facts on their way out: what is news, what goes out together, and what a message says of its age."""
 
 import asyncio
+from typing import Any
 
 import msgspec
 import pytest
 
-from appliance.model import ContainerInfo, ContainerState, GatewayStatus
-from appliance.plane.keys import Keys
+from appliance.model import ContainerInfo, ContainerState, GatewayStatus, encode
+from appliance.model.keys import Keys, Topic
 from appliance.plane.registry import LOAD_STEP, Speaker, tells_more, told_demand
 
 pytestmark = pytest.mark.anyio
@@ -18,6 +19,10 @@ class Sent:
     def __init__(self) -> None:
         self.keys = Keys("f")
         self.log: list[tuple[str, bytes | None]] = []
+
+    def publish(self, topic: Topic[Any], value: Any, *names: str) -> None:
+        """Put a fact."""
+        self.put(self.keys(topic, *names), encode(value))
 
     def put(self, key: str, payload: bytes) -> None:
         """Note a put."""

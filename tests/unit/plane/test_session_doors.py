@@ -1,4 +1,4 @@
-"""When links are made anew after questions at wrong doors: nobody's word alone breaks a link that others use."""
+"""When links are made again after questions at wrong doors: nobody's word alone breaks a link that others use."""
 
 from hypothesis import given
 from hypothesis import strategies as st

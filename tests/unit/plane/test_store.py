@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from appliance.errors import ConfigError, ConflictError, PrerequisiteError, RefusedError
-from appliance.plane.records import Record, Write, decide
+from appliance.model.plane_api import Record, Write
+from appliance.plane.records import decide
 from appliance.plane.store import Store
 
 pytestmark = pytest.mark.anyio
@@ -238,7 +239,7 @@ async def test_a_decision_is_known_before_it_is_committed(tmp_path: Path) -> Non
 
 
 async def test_what_a_conflict_is_with_can_be_read(tmp_path: Path) -> None:
-    """A decision that fails for a record on its way to the disk is told so when that record can be read."""
+    """A decision that fails for a record on its way to the disk fails when that record can be read."""
     store = await Store.open(tmp_path / "s.sqlite")
 
     def only_new(now: Record | None) -> Record:
@@ -274,7 +275,7 @@ async def test_decisions_on_all_ways_follow_one_another(tmp_path: Path) -> None:
     await asyncio.gather(*waits)
     assert await store.record("k") == _record("k", b"120", 120)
     decided, committed = store.change_soon("k", up)
-    # The same again finds it done, and is told so only when it is on the disk.
+    # The same again finds it done, and is answered only when it is on the disk.
     again, kept = store.change_soon("k", lambda now: now)
     assert (await again, await kept) == (await decided, await committed)
     await store.close()

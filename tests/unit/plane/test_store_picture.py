@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.plane.records import Record
+from appliance.model.plane_api import Record
 from appliance.plane.store import Picture
 
 _KEYS = st.sampled_from(["a", "b", "c", "d"])

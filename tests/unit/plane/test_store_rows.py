@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from appliance.model.plane_api import Record
 from appliance.plane import store
-from appliance.plane.records import Record, digest
+from appliance.plane.records import digest
 from appliance.plane.store import TABLES, put_row, read_digests, read_kept, read_keys, read_records
 
 _KEYS = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="\U0010ffff"), min_size=1, max_size=6)

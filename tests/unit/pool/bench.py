@@ -14,7 +14,7 @@ from appliance.pool.pool import Call, Pool
 from appliance.pool.pressure import Reading
 from appliance.pool.selection import Candidate, Decision
 from appliance.pool.settings import PoolConfig
-from appliance.pool.state import ALONE, State
+from appliance.pool.volumes import ALONE, State
 from appliance.skills.catalogue import Catalogue
 from tests.unit.pool.fake_engine import FakeEngine
 

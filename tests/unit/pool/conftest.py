@@ -1,4 +1,4 @@
-"""Pools without containers, runners without pools, and skills that do what they are told."""
+"""Pools without containers, runners without pools, and skills that do what tests say."""
 
 import asyncio
 import contextlib

@@ -98,9 +98,15 @@ class FakeEngine:
             folder = Path(skill["folder"])
             skill["folder"] = str(Path(back[str(folder.parent)]) / folder.name)
         runner["roots"] = {name: back[path] for name, path in runner["roots"].items()}
-        file.write_text(json.dumps(runner))
         scratch = self.scratch / container
         scratch.mkdir()
+        runner["folders"] = str(scratch / "folders")
+        (scratch / "folders").mkdir()
+        for target, source in back.items():
+            if target.startswith("/folders/"):
+                (scratch / target.lstrip("/")).symlink_to(source)
+        runner["cache"] = back.get(runner["cache"], "")
+        file.write_text(json.dumps(runner))
         self.processes[container] = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "runner.main",
             "--socket", f"{back['/run/swiftbot']}/runner.sock", "--spec", str(file),

@@ -72,7 +72,7 @@ async def end(waiting: dict[str, "asyncio.Task[PooledContainer]"]) -> None:
 
 
 async def test_a_free_container_goes_to_whose_turn_it_is() -> None:
-    """By priority, then in turns between submitters, and not by who came first; positions are told in that order."""
+    """By priority, then in turns between submitters, and not by who came first; positions follow that order."""
     books = full_books()
     waiting = await queued(
         books,
@@ -162,7 +162,7 @@ async def test_a_start_that_ends_first_is_taken() -> None:
 
 
 async def test_a_start_that_fails_or_is_given_up_leaves_nothing_held() -> None:
-    """A failed start is told to whoever waits for it; one who goes away gives back what was handed over meanwhile."""
+    """A run that waits hears of a failed start; one that goes away gives back what was handed over meanwhile."""
     books, started = full_books(), asyncio.get_running_loop().create_future()
     started.set_result(PoolError("it ended at once"))
     with pytest.raises(PoolError, match="ended at once"):
@@ -196,7 +196,7 @@ async def test_those_without_a_start_are_served_in_turn_with_those_that_have_one
 
 
 async def test_the_planner_sees_who_has_a_container_for_long() -> None:
-    """A run that takes longer than a start of its image is told apart from one that has just begun."""
+    """A run that takes longer than a start of its image is distinguished from one that has just begun."""
     books, costs = full_books(), ColdCosts(500.0)
     for name in ("c1", "c2"):
         books.add(each := container(name, "base"))

@@ -45,6 +45,19 @@ def test_who_writes_much_while_the_disk_is_short_has_to_end(tmp_path: Path) -> N
     assert it.overrun(20.0)
 
 
+def test_the_cache_is_watched_as_volumes_are(tmp_path: Path) -> None:
+    """What a run caches counts with what it writes into volumes."""
+    cache, beside = tmp_path / "cache", tmp_path / "beside"
+    cache.mkdir()
+    beside.mkdir()
+    it = Disk(tmp_path / "no volumes", cache, beside=beside, reserve_mb=ALL_MB)
+    it.begin()
+    it._since -= 1.0
+    assert not it.overrun(0.0)
+    (cache / "decoded").write_bytes(bytes((OWN_MB + 1) * 2**20))
+    assert it.overrun(10.0)
+
+
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Count how often the volumes are gone through."""
     real, walks = Disk._written, []

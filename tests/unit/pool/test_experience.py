@@ -82,7 +82,7 @@ def test_costs_are_known_again() -> None:
 
 
 async def test_kept_and_recalled() -> None:
-    """What is told at the end is recalled at the next start; a full disk costs only that."""
+    """What is saved at the end is recalled at the next start; a full disk costs only that."""
     shelf = Shelf()
     told = Experience(cold_ms={"base": (1.0, 2.0)})
     recalled: list[Experience] = []

@@ -120,7 +120,7 @@ def test_aging_counts_whole_steps() -> None:
 
 
 def test_expected_waits_come_from_what_was_measured() -> None:
-    """Nothing is told before anything was measured; then mean time, position and how many are served at once."""
+    """Nothing is estimated before anything was measured; then mean time, position and how many are served at once."""
     completions = Completions()
     assert completions.expected_s(3, 2) is None
     completions.ended(2.0)

@@ -74,7 +74,7 @@ def test_one_line_sources() -> None:
 
 
 def test_a_host_without_sources(tmp_path: Path) -> None:
-    """A machine that is no Debian, or has no source of its own release, is told what to do instead."""
+    """A machine that is no Debian, or has no source of its own release, hears what to do instead."""
     with pytest.raises(PrerequisiteError, match="os-release"):
         images.host_sources(tmp_path)
     (tmp_path / "etc/apt/sources.list.d").mkdir(parents=True)
@@ -105,7 +105,7 @@ def test_names_depend_on_what_goes_in(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def test_unknown_image(catalogue: Catalogue) -> None:
     """An image that is not in the catalogue is refused with those that are."""
-    with pytest.raises(NotFoundError, match="base, vision"):
+    with pytest.raises(NotFoundError, match="base, learn, vision"):
         await images.build("nonsense", catalogue)
 
 

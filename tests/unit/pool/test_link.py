@@ -1,6 +1,7 @@
 """The pool's tie to Podman, with the real client and something that answers as Podman does."""
 
 import asyncio
+import contextlib
 import os
 import time
 from pathlib import Path
@@ -28,7 +29,7 @@ async def _answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) ->
 
 
 async def test_what_is_missing_at_the_start_may_come(short_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No runtime directory, no socket, nobody behind it, Podman: each is told with its remedy, and tried again."""
+    """No runtime directory, no socket, nobody behind it, Podman: each is reported with its remedy, and tried again."""
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     monkeypatch.setattr(engine, "RUNTIME_DIRS", short_dir)
     connected: list[str] = []
@@ -64,7 +65,7 @@ async def test_what_is_missing_at_the_start_may_come(short_dir: Path, monkeypatc
 
 
 async def test_a_podman_that_stands_still_and_one_that_hangs_up_give_no_sign_of_life(short_dir: Path) -> None:
-    """Each is told with its reason and remedy; one that answers again is heard over a connection that is kept."""
+    """Each is reported with its reason and remedy; one that answers again is heard over a connection that is kept."""
     asked: list[int] = []
     still = False
 
@@ -95,6 +96,27 @@ async def test_a_podman_that_stands_still_and_one_that_hangs_up_give_no_sign_of_
     still = False
     await podman.ping(60.0)
     podman.hang_up()
+    podman.close()
+    server.close()
+    await server.wait_closed()
+
+
+async def test_removing_waits_once_for_a_podman_that_hangs(short_dir: Path) -> None:
+    """Podman that does not answer the kill is not asked for more: each question holds a thread until its timeout."""
+    asked: list[bytes] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+            asked.append((await reader.readuntil(b"\r\n\r\n")).split(b"?")[0])
+            await reader.read()
+        writer.close()
+
+    socket = short_dir / "p.sock"
+    server = await asyncio.start_unix_server(serve, socket)
+    podman = PodmanEngine(f"unix://{socket}", threads=1, timeout_s=1.0)
+    with pytest.raises(UnreachableError, match="does not answer"):
+        await podman.remove("c1")
+    assert [each.rpartition(b"/")[2] for each in asked] == [b"kill"]
     podman.close()
     server.close()
     await server.wait_closed()

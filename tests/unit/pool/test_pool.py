@@ -159,7 +159,7 @@ async def test_remote(bench: Any) -> None:
     assert (decision.phase, decision.gateway, decision.container) == (Phase.REMOTE_WARM, "g2", "far")
     assert (await pool.select(need, allow_remote=False)).phase is Phase.COLD
     assert (await pool.select(need, allow_remote=True, avoid={"g2": "left out"})).phase is Phase.COLD
-    assert bench.avoided == [set(), {"g2"}], "whoever looks is told whose offers do not count"
+    assert bench.avoided == [set(), {"g2"}], "the search gets the names of those whose offers do not count"
     with pytest.raises(RefusedError, match="g2"):
         await pool.run(bench.request(), decision, lambda _: None)
 
@@ -353,7 +353,7 @@ async def test_the_same_run_twice(bench: Any, tmp_path: Path) -> None:
 async def test_a_container_that_ends_in_mid_run_says_how(
     bench: Any, tmp_path: Path, exit_: Exit | None, code: str, told: str
 ) -> None:
-    """By what Podman knows of its process 1; with Podman away it is told as lost, and nothing waits for Podman."""
+    """By what Podman knows of its process 1; with Podman away it is reported as lost, and nothing waits for Podman."""
     pool = await bench.pool(reconnect_s=600.0)
     running = asyncio.create_task(bench.run(pool, bench.request(1, do="sleep", pid=str(tmp_path / "pid"))))
     await bench.until((tmp_path / "pid").exists, "the run")
@@ -403,7 +403,7 @@ async def test_a_run_that_its_runner_does_not_end_is_ended_by_the_watchdog(
 async def test_a_podman_that_stands_still_is_a_problem_until_it_answers(
     bench: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is asked of it meanwhile: the watch finds it, whoever shows the pool is told, and it goes by itself."""
+    """Nothing is asked of it meanwhile: the watch finds it, the status shows it, and it goes by itself."""
     monkeypatch.setattr(link_module, "WATCH_S", 0.02)
     pool = await bench.pool()
     assert not pool.problem

@@ -10,7 +10,7 @@ import pytest
 
 from appliance.errors import PoolError, RefusedError
 from appliance.model import ContainerState, Phase, RunEventKind
-from appliance.pool.api import DecisionsAsk
+from appliance.model.pool_api import DecisionsAsk
 from appliance.pool.container import PooledContainer
 from appliance.pool.pressure import Reading
 from appliance.pool.settings import PressureConfig
@@ -43,7 +43,7 @@ async def test_used_up_containers_are_replaced(bench: Any) -> None:
 
 
 async def test_one_that_has_grown_is_replaced(growing: Path, bench: Any) -> None:
-    """A container whose runner has grown beyond what it may is replaced after a run, and the reason is told."""
+    """A container whose runner has grown beyond what it may is replaced after a run, and the reason is reported."""
     pool = await bench.pool(floor={"base": 1}, capacity=1, max_growth_mb=64.0)
     await bench.ready(pool, 1)
     first, _ = await bench.run(pool, bench.request(1))

@@ -1,6 +1,9 @@
 """What a zygote loads beforehand: what runs get of it, and what happens to what hangs, crashes or eats memory."""
 
+import sys
 import textwrap
+import threading
+import types
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +75,7 @@ def test_what_preload_returns_is_there_for_runs(load: Any, tmp_path: Path) -> No
     ],
 )
 def test_what_must_be_ended(load: Any, text: str, reason: str) -> None:
-    """What hangs, crashes or eats memory is left out with its reason, its runs are told, and all else is loaded."""
+    """What hangs, crashes or eats memory is left out with its reason, its runs are reported, and all else is loaded."""
     limit_s = 0.3 if "0.3 s" in reason else 20.0
     loaded = load({"bad": text, "good": "def preload(ctx):\n    return 1\n"}, bad={"preload_s": limit_s})
     assert set(loaded.problems) == {"preload bad"}
@@ -104,7 +107,7 @@ def test_a_file_that_comes_later(load: Any, tmp_path: Path) -> None:
 
 
 def test_preload_without_leave(load: Any) -> None:
-    """A `preload` that the manifest gives no memory is not called, and that is told."""
+    """A `preload` that the manifest gives no memory is not called, and that is reported."""
     loaded = load({"greedy": "def preload(ctx):\n    raise AssertionError\n"}, greedy={"preload_mb": 0})
     assert "set preload_mb" in loaded.problems["preload greedy"]
 
@@ -119,7 +122,7 @@ def test_a_volume_that_is_not_there(load: Any) -> None:
 
 
 def test_threads_are_told(load: Any) -> None:
-    """A thread that is running when the zygote forks would be lost: who started it is told."""
+    """A thread that is running when the zygote forks would be lost: who started it is reported."""
     text = """
     import threading
     stop = threading.Event()
@@ -131,6 +134,26 @@ def test_threads_are_told(load: Any) -> None:
         assert "1 threads" in loaded.problems["threads of threaded"]
     finally:
         loaded.handlers["threaded"].stop.set()
+
+
+def test_a_thread_that_ends_meanwhile(load: Any) -> None:
+    """A thread that ends while a handler starts one hides nothing."""
+    ending, stop = threading.Event(), threading.Event()
+    before = threading.Thread(target=ending.wait, daemon=True)
+    before.start()
+    sys.modules["before"] = types.SimpleNamespace(thread=before, ending=ending, stop=stop)  # type: ignore[assignment]
+    text = """
+    import threading
+    import before
+    threading.Thread(target=before.stop.wait, daemon=True).start()
+    before.ending.set()
+    before.thread.join()
+    """
+    try:
+        assert "1 threads" in load({"threaded": text}, proven=True).problems["threads of threaded"]
+    finally:
+        stop.set()
+        del sys.modules["before"]
 
 
 def test_a_proven_make_is_not_rehearsed(load: Any, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ def test_the_worked_example() -> None:
 
 
 def test_between_the_marks_nothing_changes() -> None:
-    """Neither high nor low: the budget stays, and the time of calm begins anew."""
+    """Neither high nor low: the budget stays, and the time of calm begins again."""
     squeeze = Squeeze(PressureConfig(), memory_mb=4096)
     squeeze.heard(TIGHT, held_mb=4096, now=0.0)
     for now in range(1, 200):

@@ -110,7 +110,7 @@ async def test_a_handler_that_sleeps_is_cancelled(bench: Any, tmp_path: Path) ->
 
 
 async def test_what_has_ended_cannot_be_cancelled(bench: Any) -> None:
-    """Whoever asks is told that there is nothing, and the next run is not touched (ray-project/ray#39145)."""
+    """The asker hears that there is nothing, and the next run is not touched (ray-project/ray#39145)."""
     pool = await bench.pool()
     await bench.run(pool, bench.request(1))
     assert not await pool.cancel("t/s1/1")

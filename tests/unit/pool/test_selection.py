@@ -1,11 +1,24 @@
 """Container selection as Algorithm 1 has it."""
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import ContainerInfo, ContainerState, Need, Phase, VolumeInfo, Way
-from appliance.pool.selection import MOST_CONSIDERED, Candidate, Facts, best_remote, score, select, size_text
+from appliance.pool.selection import (
+    BRING_MS,
+    MOST_CONSIDERED,
+    UNMEASURED,
+    Candidate,
+    Facts,
+    Link,
+    mig_cost_ms,
+    score,
+    select,
+    size_text,
+)
 from appliance.pool.settings import PoolConfig, Weights
 
 IMAGES = ("base", "vision", "other")
@@ -51,7 +64,7 @@ offered = st.lists(candidates, max_size=6, unique_by=lambda each: (each.containe
 @st.composite
 def some_facts(draw: st.DrawFn) -> Facts:
     """Inputs and state on any gateway, behind links of any speed."""
-    ms_per_mb = draw(st.floats(0, 100))
+    link = Link(bytes_per_s=draw(st.floats(1e6, 1e10)), round_trip_ms=draw(st.floats(0, 100)))
     volumes = draw(
         st.dictionaries(
             st.sampled_from(VOLUMES),
@@ -64,19 +77,15 @@ def some_facts(draw: st.DrawFn) -> Facts:
             name: tuple(VolumeInfo(name=name, gateway=each, generation=1, size_bytes=size) for each in gateways)
             for name, (gateways, size) in volumes.items()
         },
-        files_ms=lambda size, _: size / 1e6 * ms_per_mb,
-        state_ms=lambda size, _: size / 1e6 * (ms_per_mb + 5),
+        links=dict.fromkeys(("g1", "g2", "g3"), link),
         avoid=draw(st.dictionaries(st.just("g3"), st.just("it lies"), max_size=1)),
     )
 
 
 MAPS = VolumeInfo(name="maps", gateway="g2", generation=3, size_bytes=40_000_000)
-SLOW = Facts(
-    volumes={"maps": (MAPS,)},
-    files_ms=lambda size, _: size / 50_000,
-    state_ms=lambda size, _: size / 50_000 + size / 200_000,
-)
-"""40 MB of state on g2, 50 MB/s away: 800 ms, and 200 ms to pack and unpack."""
+LINK = Link(bytes_per_s=50e6, pack_bytes_per_s=400e6, unpack_bytes_per_s=400e6, round_trip_ms=2.0)
+SLOW = Facts(volumes={"maps": (MAPS,)}, links={"g1": LINK, "g2": LINK})
+"""40 MB of state on g2, 50 MB/s away: 800 ms, 200 ms to pack and unpack, and 42 ms however small it were."""
 WITH_MAPS = Need(image="base", volumes=("maps",))
 
 
@@ -189,15 +198,15 @@ def test_the_cheaper_way_is_taken_and_every_decision_is_explained(
 
 
 def test_the_subtask_goes_to_its_state_when_that_is_cheaper() -> None:
-    """40 MB of state on g2: a container that is ready there for 2 ms beats bringing it here for 1000 ms."""
+    """40 MB of state on g2: a container that is ready there for 2 ms beats bringing it here for 1042 ms."""
     offers = [there("far", volumes=("maps",))]
     decision = select(WITH_MAPS, [ready("near")], offers, 500, PoolConfig(), gateway="g1", facts=SLOW)
     assert (decision.phase, decision.way, decision.gateway) == (Phase.REMOTE_WARM, Way.RUN_THERE, "g2")
     assert decision.choice is not None
     refused = next(each for each in decision.choice.considered if each.container == "near")
     assert refused.way is Way.BRING_HERE
-    assert refused.cost_ms == pytest.approx(1000)
-    assert refused.verdict == "1000 ms for 40 MB of state, dearer"
+    assert refused.cost_ms == pytest.approx(1042)
+    assert refused.verdict == "1042 ms for 40 MB of state, dearer"
 
 
 def test_the_state_comes_here_when_that_is_cheaper() -> None:
@@ -205,20 +214,19 @@ def test_the_state_comes_here_when_that_is_cheaper() -> None:
     facts = Facts(
         volumes={"maps": (VolumeInfo(name="maps", gateway="g2", generation=1, size_bytes=1_000_000),)},
         inputs={"g1": 10_000_000},
-        files_ms=SLOW.files_ms,
-        state_ms=SLOW.state_ms,
+        links=SLOW.links,
     )
     offers = [there("far", volumes=("maps",))]
     decision = select(WITH_MAPS, [ready("near")], offers, 500, PoolConfig(), gateway="g1", facts=facts)
     assert (decision.phase, decision.way, decision.container) == (Phase.LOCAL_WARM, Way.BRING_HERE, "near")
-    assert decision.cost_ms == pytest.approx(25)
+    assert decision.cost_ms == pytest.approx(25 + BRING_MS + 2)
 
 
 def test_without_a_container_anywhere_the_state_comes_to_a_new_one() -> None:
     """Bring here with a cold start costs both, and says so."""
     decision = select(WITH_MAPS, [], [], 500, PoolConfig(), gateway="g1", facts=SLOW)
     assert (decision.phase, decision.way, decision.container) == (Phase.COLD, Way.BRING_HERE, None)
-    assert decision.cost_ms == pytest.approx(1500)
+    assert decision.cost_ms == pytest.approx(1542)
     assert "40 MB of state" in decision.why
 
 
@@ -234,13 +242,13 @@ def test_state_that_is_here_needs_nobody_else() -> None:
 
 def test_input_bytes_keep_a_subtask_near_them() -> None:
     """100 MB of input here cost 2 s to g2: more than half a cold start, and the record says so."""
-    facts = Facts(inputs={"g1": 100_000_000}, files_ms=SLOW.files_ms)
+    facts = Facts(inputs={"g1": 100_000_000}, links=SLOW.links)
     decision = select(Need(image="base"), [], [there("far")], 500, PoolConfig(), gateway="g1", facts=facts)
     assert decision.phase is Phase.COLD
     assert decision.choice is not None
     far = next(each for each in decision.choice.considered if each.gateway == "g2")
     assert far.verdict == "costs 2002 ms, more than 0.5 of a cold start (500 ms)"
-    there_too = Facts(inputs={"g2": 100_000_000}, files_ms=SLOW.files_ms)
+    there_too = Facts(inputs={"g2": 100_000_000}, links=SLOW.links)
     decision = select(Need(image="base"), [], [there("far")], 500, PoolConfig(), gateway="g1", facts=there_too)
     assert decision.gateway == "g2"
 
@@ -261,6 +269,28 @@ def test_verdicts_name_what_stood_in_the_way() -> None:
     assert verdicts == {"": "taken", "b": "busy", "v": "score 0.48 below 0.60", "far": "had none when asked"}
 
 
+@given(
+    size=st.integers(0, 10**12),
+    link=st.builds(Link, bytes_per_s=st.none() | st.floats(1, 1e12), pack_bytes_per_s=st.none() | st.floats(1, 1e12)),
+)
+def test_migration_cost_is_finite_and_grows_with_size(size: int, link: Link) -> None:
+    """MigCost is never negative or infinite and grows with the bytes, whatever was measured."""
+    assert 0 <= mig_cost_ms([(size, link)]) < math.inf
+    assert mig_cost_ms([(size, link)]) <= mig_cost_ms([(size + 1, link)])
+
+
+def test_migration_cost_by_hand() -> None:
+    """Each part of the formula: state, files, start; and a link that was not measured."""
+    link = Link(bytes_per_s=100e6, pack_bytes_per_s=500e6, unpack_bytes_per_s=250e6, round_trip_ms=3.0)
+    # 100 MB over 100 MB/s, packed at 500 and unpacked at 250 MB/s.
+    assert mig_cost_ms([(100_000_000, link)]) == pytest.approx(1000 + 200 + 400 + BRING_MS + 3)
+    assert mig_cost_ms((), files=[(50_000_000, link)], start_ms=400) == pytest.approx(500 + 400)
+    # 12.5 MB at a guess of 12.5 MB/s, and 200 MB/s to pack and to unpack.
+    assert mig_cost_ms([(12_500_000, UNMEASURED)]) == pytest.approx(BRING_MS + 5 + 1000 + 2 * 62.5)
+    assert mig_cost_ms(()) == 0
+    assert mig_cost_ms([(-(10**9), link)]) == BRING_MS + 3, "a size that cannot be makes no gateway attractive"
+
+
 def test_sizes_are_told_in_round_figures() -> None:
     """Bytes, kilobytes, megabytes."""
     assert [size_text(each) for each in (0, 999, 1500, 40_000_000)] == ["0 B", "999 B", "2 kB", "40 MB"]
@@ -271,10 +301,8 @@ def test_order_does_not_matter(need: Need, remote: list[Candidate], random: obje
     """All who see the same offers choose the same."""
     shuffled = list(remote)
     random.shuffle(shuffled)  # type: ignore[attr-defined]
-    first = best_remote(remote, need, cold_ms=500, config=PoolConfig())
-    second = best_remote(shuffled, need, cold_ms=500, config=PoolConfig())
-    assert (first is None) == (second is None)
-    assert first is None or second is None or first[0].container.id == second[0].container.id
+    first, second = (select(need, [], offers, 500, PoolConfig()) for offers in (remote, shuffled))
+    assert (first.gateway, first.container) == (second.gateway, second.container)
 
 
 @given(needs, some(), offered)

@@ -10,9 +10,9 @@ from msgspec.structs import replace
 
 from appliance.errors import NotFoundError, PrerequisiteError, RefusedError, UnreachableError
 from appliance.model import ContainerState, Phase, RunEventKind
-from appliance.pool.api import ReleaseAsk
+from appliance.model.pool_api import ReleaseAsk
 from appliance.pool.selection import Decision
-from appliance.pool.state import State
+from appliance.pool.volumes import State
 from appliance.skills.catalogue import Catalogue
 
 pytestmark = pytest.mark.anyio
@@ -51,7 +51,7 @@ class Elsewhere:
 
 
 async def test_state_comes_before_the_run(bench: Any) -> None:
-    """The newest state is brought before a run begins, and its use ends before the run's end is told."""
+    """The newest state is brought before a run begins, and its use ends before the run's end is published."""
     there = Elsewhere()
     pool = await bench.pool(state=there.state(), floor={"base": 1})
     await bench.ready(pool, 1)
@@ -152,7 +152,7 @@ async def test_an_image_that_nobody_has(bench: Any) -> None:
     await bench.until(lambda: bool(pool.problem), "the pool says so")
     reference = bench.engine.references["base"]
     assert pool.problem == (
-        f"image {reference} is not on g1: no other gateway is known that has {reference} (build it)"
+        f"image {reference} is not on g1: no other gateway is known that has {reference} (swiftbot images build)"
     )
     tried = bench.engine.calls["create"]
     with pytest.raises(RefusedError, match="is not on g1"):

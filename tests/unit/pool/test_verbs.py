@@ -8,13 +8,13 @@ import pytest
 
 from appliance.errors import NotFoundError, PayloadError, PoolError, RefusedError
 from appliance.model import ContainerState, PoolHint
-from appliance.pool.api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
+from appliance.model.pool_api import DecisionsAsk, EvictAsk, ReleaseAsk, WarmAsk
 
 pytestmark = pytest.mark.anyio
 
 
 async def test_warm(bench: Any) -> None:
-    """An operator has containers ready besides those that work, is told when they are, and why they were started."""
+    """An operator has containers ready besides those that work, hears when they are, and why they were started."""
     pool = await bench.pool()
     warmed = await pool.verbs.warm(WarmAsk(image="base", count=2, wait_s=30))
     assert (warmed.ready, warmed.starting, warmed.problem) == (2, 0, "")

@@ -154,7 +154,7 @@ def test_a_missing_wheel_is_found_before_anything_is_built(tmp_path: Path) -> No
 
 
 def test_files_of_a_wheel_go_where_they_belong(tmp_path: Path) -> None:
-    """Modules beside each other, scripts with the image's Python, data below /usr/local; what it needs is told."""
+    """Modules beside each other, scripts with the image's Python, data below /usr/local; what it needs is reported."""
     data = {
         "greetings-1.0.data/scripts/greet": "#!python\nprint('hello')\n",
         "greetings-1.0.data/platlib/greetings/fast.py": "x = 1\n",

@@ -5,8 +5,8 @@ import math
 import msgspec
 import pytest
 
-from appliance.model import Pose, RobotInfo, Site, encode
-from appliance.plane.keys import Keys
+from appliance.model import Pose, RobotInfo, Site, encode, keyspace
+from appliance.model.keys import Keys
 from appliance.record.models import LoggedMessage
 from appliance.record.schemas import FRAME_TRANSFORM, LOCATION_FIX, POSE_IN_FRAME, SITE_FRAME, Foxglove, facing
 
@@ -15,9 +15,11 @@ SITE = Site(latitude_deg=47.0, longitude_deg=8.0, altitude_m=400.0)
 
 
 def _made(pose: Pose | None, *, site: Site | None = SITE) -> dict[str, dict[str, object]]:
-    derive = Foxglove(KEYS, "rec", site=site).deriving(KEYS.robot("r1"))
+    derive = Foxglove(KEYS, "rec", site=site).deriving(KEYS(keyspace.ROBOT, "r1"))
     assert derive is not None
-    message = LoggedMessage(KEYS.robot("r1"), 1_500_000_000, encode(RobotInfo(id="other", kind="zenoh", pose=pose)))
+    message = LoggedMessage(
+        KEYS(keyspace.ROBOT, "r1"), 1_500_000_000, encode(RobotInfo(id="other", kind="zenoh", pose=pose))
+    )
     return {each.topic.rsplit("/", 1)[-1]: msgspec.json.decode(each.payload) for each in derive(message)}
 
 
@@ -50,9 +52,18 @@ def test_without_a_site_there_are_no_places_and_without_a_pose_nothing() -> None
 @pytest.mark.parametrize("payload", [b"{", b"[]", b'{"id":"r","kind":"k","pose":{"x":1e999}}', b"\xff"])
 def test_what_is_malformed_makes_nothing(payload: bytes) -> None:
     """Garbage on a robot's key is kept as it is, and no panel is led astray by it."""
-    derive = Foxglove(KEYS, "rec", site=SITE).deriving(KEYS.robot("r1"))
+    derive = Foxglove(KEYS, "rec", site=SITE).deriving(KEYS(keyspace.ROBOT, "r1"))
     assert derive is not None
-    assert derive(LoggedMessage(KEYS.robot("r1"), 5, payload)) == ()
+    assert derive(LoggedMessage(KEYS(keyspace.ROBOT, "r1"), 5, payload)) == ()
+
+
+@pytest.mark.parametrize("name", ["a$*b", "a\nb", "\x7f"])
+def test_a_name_that_cannot_be_in_a_key_makes_nothing(name: str) -> None:
+    """A stranger may put under any key that Zenoh takes: it is recorded, and the recorder goes on."""
+    key = f"swiftbot/f1/robot/{name}/state"
+    derive = Foxglove(KEYS, "rec", site=SITE).deriving(key)
+    assert derive is not None
+    assert derive(LoggedMessage(key, 5, encode(RobotInfo(id="r1", kind="zenoh", pose=Pose())))) == ()
 
 
 def test_north_is_along_y() -> None:

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.model import Plan, RobotInfo, SoftStop, Subtask, TaskRecord, TaskState, encode
-from appliance.plane.keys import Keys
+from appliance.model import Plan, RobotInfo, SoftStop, Subtask, TaskRecord, TaskState, encode, keyspace
+from appliance.model.keys import Keys
+from appliance.model.recorder_api import Incident, Trigger
 from appliance.record.incidents import EACH, EVERY, Ring, Triggers
-from appliance.record.models import Incident, LoggedMessage, Trigger
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
 from appliance.record.recorder import Pipeline
 from appliance.record.segments import LogWriter
@@ -33,15 +34,15 @@ def _incident(triggers: Triggers, key: str, payload: bytes) -> Incident | None:
 
 
 def test_a_failed_task_is_an_incident_once() -> None:
-    """When it fails, not each time its record is told again; one of its subtasks failing is none."""
+    """When it fails, not each time its record is published again; one of its subtasks failing is none."""
     triggers = Triggers(KEYS, "rec")
     running = encode({"id": "t1", "state": "running", "subtasks": [{"state": "failed"}]})
-    assert _incident(triggers, KEYS.task("t1"), running) is None
-    found = _incident(triggers, KEYS.task("t1"), encode(FAILED))
+    assert _incident(triggers, KEYS(keyspace.TASK_UPDATE, "t1"), running) is None
+    found = _incident(triggers, KEYS(keyspace.TASK_UPDATE, "t1"), encode(FAILED))
     assert found is not None
-    assert (found.reason, found.key) == ("task failed", KEYS.task("t1"))
-    assert _incident(triggers, KEYS.task("t1"), encode(FAILED)) is None
-    assert _incident(triggers, KEYS.task("t2"), encode(FAILED)) is not None
+    assert (found.reason, found.key) == ("task failed", KEYS(keyspace.TASK_UPDATE, "t1"))
+    assert _incident(triggers, KEYS(keyspace.TASK_UPDATE, "t1"), encode(FAILED)) is None
+    assert _incident(triggers, KEYS(keyspace.TASK_UPDATE, "t2"), encode(FAILED)) is not None
 
 
 def test_a_failsafe_is_an_incident_when_it_begins() -> None:
@@ -49,7 +50,7 @@ def test_a_failsafe_is_an_incident_when_it_begins() -> None:
     triggers = Triggers(KEYS, "rec")
     calm = encode(RobotInfo(id="r1", kind="mavlink"))
     unwell = encode({"id": "r1", "failsafe": "battery low"})
-    told = [_incident(triggers, KEYS.robot("r1"), each) for each in (calm, unwell, unwell, calm, unwell)]
+    told = [_incident(triggers, KEYS(keyspace.ROBOT, "r1"), each) for each in (calm, unwell, unwell, calm, unwell)]
     assert [each.reason if each else "" for each in told] == ["", "failsafe", "", "", "failsafe"]
 
 
@@ -66,8 +67,8 @@ def test_a_failsafe_is_an_incident_when_it_begins() -> None:
 def test_a_robot_that_is_well_is_no_incident(calm: bytes) -> None:
     """However it writes that it has no failsafe, with spaces too; so that the next one is not taken for an old one."""
     triggers = Triggers(KEYS, "rec")
-    assert _incident(triggers, KEYS.robot("r1"), calm) is None
-    found = _incident(triggers, KEYS.robot("r1"), b'{"id": "r1", "failsafe": "battery low"}')
+    assert _incident(triggers, KEYS(keyspace.ROBOT, "r1"), calm) is None
+    found = _incident(triggers, KEYS(keyspace.ROBOT, "r1"), b'{"id": "r1", "failsafe": "battery low"}')
     assert found is not None
     assert found.reason == "failsafe"
 
@@ -75,14 +76,14 @@ def test_a_robot_that_is_well_is_no_incident(calm: bytes) -> None:
 @pytest.mark.parametrize("payload", [b'{"failsafe":', b'["failsafe"]', b'{"failsafe":' + b"[" * 20_000, b'"failsafe"'])
 def test_states_that_are_none_are_no_incident(payload: bytes) -> None:
     """A stranger's put on a robot's key stops nobody."""
-    assert _incident(Triggers(KEYS, "rec"), KEYS.robot("r1"), payload) is None
+    assert _incident(Triggers(KEYS, "rec"), KEYS(keyspace.ROBOT, "r1"), payload) is None
 
 
 def test_a_soft_stop_is_an_incident_once() -> None:
     """The gateway that keeps it tells it again; a second stop is another."""
     triggers = Triggers(KEYS, "rec")
     stop = encode(SoftStop(id="a1", by="kim"))
-    told = [_incident(triggers, KEYS.soft_stop(act), stop) for act in ("a1", "a1", "a2")]
+    told = [_incident(triggers, KEYS(keyspace.STOP, act), stop) for act in ("a1", "a1", "a2")]
     assert [each.reason if each else "" for each in told] == ["stop", "", "stop"]
 
 
@@ -90,11 +91,13 @@ def test_a_soft_stop_is_an_incident_once() -> None:
 def test_somebody_asks(recorder: str, heard: bool) -> None:
     """A trigger is heard by the recorder it names, and by all if it names all; a malformed one by none."""
     triggers = Triggers(KEYS, "rec")
-    found = _incident(triggers, KEYS.recorder_trigger(recorder), encode(Trigger(reason="odd noise", by="kim")))
+    found = _incident(
+        triggers, KEYS(keyspace.RECORDER_TRIGGER, recorder), encode(Trigger(reason="odd noise", by="kim"))
+    )
     assert (found is not None) == heard
     if found is not None:
         assert (found.reason, found.detail) == ("asked", "odd noise (by kim)")
-    assert _incident(triggers, KEYS.recorder_trigger(recorder), b"{") is None
+    assert _incident(triggers, KEYS(keyspace.RECORDER_TRIGGER, recorder), b"{") is None
 
 
 @given(st.lists(st.tuples(st.floats(0, 3), st.integers(0, 50)), max_size=60))
@@ -153,8 +156,8 @@ def test_only_what_is_around_an_incident_is_written(
     def second(number: int) -> None:
         now[0] = 100.0 + number
         if number in (20, 60):
-            pipeline.write(_of(KEYS.task(f"t{number}"), encode(FAILED)))
-        pipeline.write(LoggedMessage(KEYS.notice("ops"), number + 1, b'{"n":%d}' % number, JSON))
+            pipeline.write(_of(KEYS(keyspace.TASK_UPDATE, f"t{number}"), encode(FAILED)))
+        pipeline.write(LoggedMessage(KEYS(keyspace.NOTICE, "ops"), number + 1, b'{"n":%d}' % number, JSON))
         pipeline.tick()
 
     for number in range(100):
@@ -162,7 +165,8 @@ def test_only_what_is_around_an_incident_is_written(
     writer.close()
     assert len(writer.files) == 2
     found = [
-        [msgspec.json.decode(each.payload)["n"] for each in read(path, keys=KEYS.notice())] for path in writer.files
+        [msgspec.json.decode(each.payload)["n"] for each in read(path, keys=KEYS(keyspace.NOTICE))]
+        for path in writer.files
     ]
     assert found == [list(range(10, 26)), list(range(50, 66))]
     told = [info(path) for path in writer.files]
@@ -180,7 +184,7 @@ def test_gaps_alone_are_no_incident(recorder: Callable[[list[float]], tuple[Pipe
         writer.miss("gw-1", 1, "gw/gw-1/mavlink/0/rx", number + 1)
         pipeline.tick()
     assert not writer.files
-    pipeline.write(_of(KEYS.task("t1"), encode(FAILED)))
+    pipeline.write(_of(KEYS(keyspace.TASK_UPDATE, "t1"), encode(FAILED)))
     pipeline.tick()
     writer.close()
     assert len(writer.files) == 1
@@ -194,10 +198,12 @@ def test_plans_are_attached(tmp_path: Path) -> None:
     pipeline = Pipeline(config, fleet="f1", writer=writer)
     plan = Plan(domain="navigation", subtasks=(Subtask(id="s1", skill="goto"),))
     planned = {"task": "t-1", "sequence": 2, "kind": "planned", "plan": plan, "at_ns": 1, "coordinator": "g1"}
-    pipeline.write(_of(KEYS.transition("t-1"), encode(planned)))
+    pipeline.write(_of(KEYS(keyspace.TRANSITION, "t-1"), encode(planned)))
     for number, (kind, its) in enumerate(
         (("dispatched", None), ("proposed", plan), ("approved", plan), ("approved", None), ("replanned", plan)), start=3
     ):
-        pipeline.write(_of(KEYS.transition("t-1"), encode(planned | {"sequence": number, "kind": kind, "plan": its})))
+        pipeline.write(
+            _of(KEYS(keyspace.TRANSITION, "t-1"), encode(planned | {"sequence": number, "kind": kind, "plan": its}))
+        )
     writer.close()
     assert info(writer.files[0]).attachments == tuple(f"plan-t-1-{number}.json" for number in (2, 4, 5, 7))

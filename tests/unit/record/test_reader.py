@@ -13,8 +13,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from appliance.errors import NotFoundError, RecordError
-from appliance.model import LogLine, encode
-from appliance.plane.keys import Keys
+from appliance.model import LogLine, encode, keyspace
+from appliance.model.keys import Keys
 from appliance.record import reader
 from appliance.record.edit import Select, cat, recover
 from appliance.record.models import LoggedMessage
@@ -138,7 +138,7 @@ def test_a_chunk_that_unpacks_to_the_memory(
     out = io.BytesIO()
     writer = Writer(out, chunk_size=2**30, compression=compression)
     writer.start()
-    channel = writer.register_channel(Keys("f1").recorder_gap("x"), "json", 0)
+    channel = writer.register_channel(Keys("f1")(keyspace.RECORDER_GAP, "x"), "json", 0)
     writer.add_message(channel, 1, bytes(2**26), 1)
     writer.finish()
     data = out.getvalue()
@@ -164,7 +164,7 @@ def test_a_chunk_that_unpacks_to_the_memory(
 
 
 def test_lz4_that_is_cut_is_damage(scratch: Path) -> None:
-    """A chunk whose packed data ends before its end costs its messages, and is told, without a checksum too."""
+    """A chunk whose packed data ends before its end costs its messages, and is reported, without a checksum too."""
     out = io.BytesIO()
     writer = Writer(out, chunk_size=10_000, compression=CompressionType.NONE, enable_crcs=False)
     writer.start()
@@ -186,12 +186,22 @@ def test_lz4_that_is_cut_is_damage(scratch: Path) -> None:
 
 @pytest.mark.parametrize("payload", [b"[" * 100_000, b'{"a":' * 100_000, b"\xff\xfe", b'{"dropped":1e999}', b""])
 def test_what_a_stranger_puts_on_the_recorders_keys(tmp_path: Path, payload: bytes) -> None:
-    """A bomb where gaps, incidents and deletions are told: it is told, read and copied as what it is, and no crash."""
+    """A bomb where gaps, incidents and deletions are written: it is reported, read and copied as it is."""
     writer = LogWriter(RecordConfig(directory=str(tmp_path), free_bytes=0, fsync=False), fleet="f1")
     writer.prepare()
     keys = Keys("f1")
-    own = [keys.recorder_gap("x"), keys.recorder_incident("x"), keys.recorder_deleted("x")]
-    for key in (*own, keys.log("g1"), keys.robot("r1"), keys.transition("t1"), keys.task("t1")):
+    own = [
+        keys(keyspace.RECORDER_GAP, "x"),
+        keys(keyspace.RECORDER_INCIDENT, "x"),
+        keys(keyspace.RECORDER_DELETED, "x"),
+    ]
+    for key in (
+        *own,
+        keys(keyspace.LOG, "g1"),
+        keys(keyspace.ROBOT, "r1"),
+        keys(keyspace.TRANSITION, "t1"),
+        keys(keyspace.TASK_UPDATE, "t1"),
+    ):
         writer.write(LoggedMessage(key, 5, payload, "application/json"))
     writer.close()
     (log,) = writer.files
@@ -215,7 +225,7 @@ def test_not_a_log(scratch: Path, content: bytes) -> None:
 
 
 def test_no_such_log(tmp_path: Path) -> None:
-    """An absent file and a folder are told apart from a bad one."""
+    """An absent file and a folder are distinguished from a bad one."""
     with pytest.raises(NotFoundError, match="no log file"):
         info(tmp_path / "absent.mcap")
     with pytest.raises(RecordError, match="cannot read"):
@@ -294,12 +304,14 @@ def _recorded(folder: Path) -> Path:
     keys = Keys("f1")
     for number in range(8):
         line = encode(LogLine(at_ns=1000 + number, level="info", source="gw-1", event=f"started {number}"))
-        writer.write(LoggedMessage(keys.log("gw-1"), 1000 + number, line, "application/json"))
+        writer.write(LoggedMessage(keys(keyspace.LOG, "gw-1"), 1000 + number, line, "application/json"))
         writer.write(
-            LoggedMessage(keys.mavlink("r1", "rx"), 1000 + number, bytes(range(30)), "application/octet-stream")
+            LoggedMessage(
+                keys(keyspace.MAVLINK, "r1", "rx"), 1000 + number, bytes(range(30)), "application/octet-stream"
+            )
         )
         if number % 3 == 2:
-            writer.drop("queue full", keys.log("gw-1"), 10, 1000 + number)
+            writer.drop("queue full", keys(keyspace.LOG, "gw-1"), 10, 1000 + number)
             writer.tick()
     writer.close()
     return writer.files[0]
@@ -307,7 +319,7 @@ def _recorded(folder: Path) -> Path:
 
 @pytest.mark.thorough
 def test_the_recorders_own_file_damaged_at_every_offset(tmp_path: Path) -> None:
-    """A byte changed, and the file cut, at each place in turn: what is read was written, and what lacks is told."""
+    """A byte changed, and the file cut, at each place in turn: what is read was written, and what lacks is reported."""
     whole = _recorded(tmp_path / "logs").read_bytes()
     log = tmp_path / "damaged.mcap"
     log.write_bytes(whole)

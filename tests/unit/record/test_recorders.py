@@ -1,7 +1,8 @@
-"""What is told of a recorder that misses messages: how many, of which keys, at once."""
+"""What is published of a recorder that misses messages: how many, of which keys, at once."""
 
 from appliance.model import RecorderNote
-from appliance.record.models import FORGET_S, SILENT_S, Recorders, RecorderStatus, kinds_text, problem_of, together
+from appliance.model.recorder_api import RecorderStatus
+from appliance.record.models import FORGET_S, SILENT_S, Recorders, kinds_text, problem_of, together
 
 
 def _status(**fields: object) -> RecorderStatus:
@@ -9,7 +10,7 @@ def _status(**fields: object) -> RecorderStatus:
 
 
 def test_misses_are_news_and_figures_are_not() -> None:
-    """A status is told at once when messages are missing, and not for each message recorded."""
+    """A status is published at once when messages are missing, and not for each message recorded."""
     recorders = Recorders()
     assert recorders.hear(_status(messages=1), 0.0)
     assert not recorders.hear(_status(messages=99), 1.0)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.model import encode
-from appliance.plane.keys import Keys
+from appliance.model import encode, keyspace
+from appliance.model.keys import Keys
 from appliance.record.models import LoggedMessage
 from appliance.record.recorder import Pipeline
 from appliance.record.redact import REDACTED, Redactor, known_secrets, names_a_secret, without_secrets
@@ -144,13 +144,13 @@ def test_no_planted_secret_is_in_the_file(tmp_path: Path) -> None:
     writer.prepare()
     pipeline = Pipeline(config, fleet="f1", writer=writer, secrets=told.secrets)
     for key, payload in (
-        (KEYS.log("g1"), encode({"event": "x", "fields": {"apiToken": PLANTED, "said": "env-secret-19be!"}})),
+        (KEYS(keyspace.LOG, "g1"), encode({"event": "x", "fields": {"apiToken": PLANTED, "said": "env-secret-19be!"}})),
         (
-            KEYS.exchange("g1", "submit"),
+            KEYS(keyspace.EXCHANGE, "g1", "submit"),
             encode({"request": {"instruction": "say file-secret-51c0", "password": PLANTED}}),
         ),
-        (KEYS.mavlink("r1", "rx"), b"\xfd" + b"x" * 12 + b"conf-secret-77aa"),
-        (KEYS.notice("ops"), b'{"password": "' + PLANTED.encode()),
+        (KEYS(keyspace.MAVLINK, "r1", "rx"), b"\xfd" + b"x" * 12 + b"conf-secret-77aa"),
+        (KEYS(keyspace.NOTICE, "ops"), b'{"password": "' + PLANTED.encode()),
     ):
         pipeline.write(LoggedMessage(key, 5, payload, "application/json"))
     writer.close()

@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from appliance.errors import RecordError
+from appliance.model import keyspace
 from appliance.record.edit import copy, recover
 from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
@@ -191,7 +192,8 @@ def test_a_damaged_attachment_costs_no_message(tmp_path: Path) -> None:
 _KILLED = """
 import sys, time
 from pathlib import Path
-from appliance.plane.keys import Keys
+from appliance.model import keyspace
+from appliance.model.keys import Keys
 from appliance.record.models import LoggedMessage
 from appliance.record.settings import RecordConfig
 from appliance.record.segments import LogWriter
@@ -200,7 +202,8 @@ writer = LogWriter(config, fleet="f1")
 writer.prepare()
 number = 0
 while True:
-    writer.write(LoggedMessage(Keys("f1").transition("t1"), number + 1, b'{"n":%d}' % number, "application/json"))
+    key = Keys("f1")(keyspace.TRANSITION, "t1")
+    writer.write(LoggedMessage(key, number + 1, b'{"n":%d}' % number, "application/json"))
     writer.tick()
     number += 1
     if number % 50 == 0:
@@ -225,7 +228,7 @@ def test_power_that_goes_costs_the_last_moments_only(tmp_path: Path, project_roo
     process.wait()
     process.stdout.close()
     (path,) = tmp_path.glob("*.mcap")
-    numbers = [msgspec.json.decode(each.payload)["n"] for each in read(path, keys=KEYS.transition())]
+    numbers = [msgspec.json.decode(each.payload)["n"] for each in read(path, keys=KEYS(keyspace.TRANSITION))]
     assert numbers == list(range(len(numbers)))
     assert len(numbers) > seen // 2
     assert info(path).recovered
@@ -257,7 +260,7 @@ def test_times_that_are_none_do_not_get_into_a_log(tmp_path: Path) -> None:
     writer = writer_of(tmp_path)
     writer._wall = lambda: 77
     for at_ns in (2**64 - 5, 2**63, -(2**63), 5):
-        assert writer.write(LoggedMessage(KEYS.transition("t1"), at_ns, b"{}", JSON))
+        assert writer.write(LoggedMessage(KEYS(keyspace.TRANSITION, "t1"), at_ns, b"{}", JSON))
     writer.close()
     told = info(writer.files[0])
     assert (told.start_ns, told.end_ns, told.problems) == (5, 77, ())

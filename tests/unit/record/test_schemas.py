@@ -4,9 +4,11 @@ from typing import Any
 
 import msgspec
 import pytest
+from msgspec import Struct
 
-from appliance.model import LogLine, Notice, TaskRecord, encode
-from appliance.plane.keys import Keys
+from appliance.model import LogLine, Notice, TaskRecord, encode, keyspace
+from appliance.model.keys import Keys
+from appliance.model.learning import ClientStatus, RunMetric
 from appliance.record.models import LoggedMessage
 from appliance.record.schemas import LOG_KIND, Foxglove, KeySchemas, flat_schema
 
@@ -19,30 +21,34 @@ def _log_of(message: LoggedMessage) -> bytes | None:
     derive = Foxglove(KEYS, "rec").deriving(message.key)
     assert derive is not None
     made = derive(message)
-    assert all(each.kind is LOG_KIND and each.topic == KEYS.recorder_log("rec") for each in made)
+    assert all(each.kind is LOG_KIND and each.topic == KEYS(keyspace.RECORDER_LOG, "rec") for each in made)
     return made[0].payload if made else None
 
 
 @pytest.mark.parametrize(
     ("key", "schema", "encoding"),
     [
-        (KEYS.status("g1"), "swiftbot.GatewayStatus", "json"),
-        (KEYS.container("g1", "c1"), "swiftbot.ContainerInfo", "json"),
-        (KEYS.log("g1"), "swiftbot.LogLine", "json"),
-        (KEYS.task("t1"), "swiftbot.TaskRecord", "json"),
-        (KEYS.run("t1", "s1"), "swiftbot.RunEvent", "json"),
-        (KEYS.robot("r1"), "swiftbot.RobotInfo", "json"),
-        (KEYS.commanded("r1"), "swiftbot.RobotCommand", "json"),
-        (KEYS.camera("r1"), "foxglove.CompressedImage", "json"),
-        (KEYS.mavlink("r1", "rx"), "", "mavlink"),
-        (KEYS.link_frames("g1", "udp-1", "tx"), "", "mavlink"),
-        (KEYS.act("g1"), "swiftbot.Act", "json"),
-        (KEYS.soft_stop("a1"), "swiftbot.SoftStop", "json"),
-        (KEYS.intake("r1"), "swiftbot.TaskRequest", "json"),
-        (KEYS.notice("ops"), "swiftbot.Notice", "json"),
-        (KEYS.recorder_status("rec"), "swiftbot.RecorderStatus", "json"),
-        (KEYS.transition("t1"), "swiftbot.Transition", "json"),
-        (KEYS.exchange("g1", "submit"), "swiftbot.Exchange", "json"),
+        (KEYS(keyspace.STATUS, "g1"), "swiftbot.GatewayStatus", "json"),
+        (KEYS(keyspace.CONTAINER, "g1", "c1"), "swiftbot.ContainerInfo", "json"),
+        (KEYS(keyspace.LOG, "g1"), "swiftbot.LogLine", "json"),
+        (KEYS(keyspace.TASK_UPDATE, "t1"), "swiftbot.TaskRecord", "json"),
+        (KEYS(keyspace.RUN_EVENT, "t1", "s1"), "swiftbot.RunEvent", "json"),
+        (KEYS(keyspace.ROBOT, "r1"), "swiftbot.RobotInfo", "json"),
+        (KEYS(keyspace.COMMANDED, "r1"), "swiftbot.RobotCommand", "json"),
+        (KEYS(keyspace.CAMERA, "r1"), "foxglove.CompressedImage", "json"),
+        (KEYS(keyspace.MAVLINK, "r1", "rx"), "", "mavlink"),
+        (KEYS(keyspace.LINK_FRAMES, "g1", "udp-1", "tx"), "", "mavlink"),
+        (KEYS(keyspace.ACT, "g1"), "swiftbot.Act", "json"),
+        (KEYS(keyspace.STOP, "a1"), "swiftbot.SoftStop", "json"),
+        (KEYS(keyspace.INTAKE, "r1"), "swiftbot.TaskRequest", "json"),
+        (KEYS(keyspace.NOTICE, "ops"), "swiftbot.Notice", "json"),
+        (KEYS(keyspace.RECORDER_STATUS, "rec"), "swiftbot.RecorderStatus", "json"),
+        (KEYS(keyspace.TRANSITION, "t1"), "swiftbot.Transition", "json"),
+        (KEYS(keyspace.EXCHANGE, "g1", "submit"), "swiftbot.Exchange", "json"),
+        (KEYS(keyspace.LEARN_RUN, "r"), "swiftbot.RunRecord", "json"),
+        (KEYS(keyspace.LEARN_ROUND, "r"), "swiftbot.RoundRecord", "json"),
+        (KEYS(keyspace.LEARN_CLIENT, "r", "part-000"), "swiftbot.ClientStatus", "json"),
+        (KEYS(keyspace.LEARN_METRIC, "r"), "swiftbot.RunMetric", "json"),
     ],
 )
 def test_each_key_has_its_kind(key: str, schema: str, encoding: str) -> None:
@@ -51,9 +57,24 @@ def test_each_key_has_its_kind(key: str, schema: str, encoding: str) -> None:
     assert (kind.schema, kind.encoding) == (schema, encoding)
 
 
+@pytest.mark.parametrize(
+    ("kind", "fields"),
+    [
+        (ClientStatus, ("progress", "samples_s", "eta_s", "loss", "epoch_s")),
+        (RunMetric, ("took_s", "all_s", "loss", "accuracy", "test_loss")),
+    ],
+)
+def test_what_is_plotted_of_learning_is_a_number_in_a_field_of_its_own(
+    kind: type[Struct], fields: tuple[str, ...]
+) -> None:
+    """Foxglove plots numbers by their path: each is one at the root, also those that may be missing."""
+    properties = flat_schema(kind)["properties"]
+    assert {properties[field]["type"] for field in fields} == {"number"}
+
+
 def test_strangers_put_is_not_called_json() -> None:
     """Bytes put on a typed key under another encoding are kept under that encoding, without schema."""
-    kind = SCHEMAS.kind_of(KEYS.status("g1"), "zenoh/bytes")
+    kind = SCHEMAS.kind_of(KEYS(keyspace.STATUS, "g1"), "zenoh/bytes")
     assert (kind.schema, kind.encoding) == ("", "zenoh/bytes")
 
 
@@ -66,14 +87,14 @@ def _nodes(node: Any) -> list[dict[str, Any]]:
 @pytest.mark.parametrize(
     "key",
     [
-        KEYS.status(),
-        KEYS.container(),
-        KEYS.log(),
-        KEYS.task(),
-        KEYS.run(),
-        KEYS.robot(),
-        KEYS.commanded(),
-        KEYS.intake(),
+        KEYS(keyspace.STATUS),
+        KEYS(keyspace.CONTAINER),
+        KEYS(keyspace.LOG),
+        KEYS(keyspace.TASK_UPDATE),
+        KEYS(keyspace.RUN_EVENT),
+        KEYS(keyspace.ROBOT),
+        KEYS(keyspace.COMMANDED),
+        KEYS(keyspace.INTAKE),
     ],
 )
 def test_schemas_are_what_foxglove_takes(key: str) -> None:
@@ -96,7 +117,7 @@ def test_nested_structs_are_inlined() -> None:
 def test_log_lines_become_foxglove_log() -> None:
     """A log line goes to the log panel with its level, time and fields; a malformed one does not."""
     line = LogLine(at_ns=1_500_000_000, level="warning", source="pool", event="container died", fields={"id": "c1"})
-    made = _log_of(LoggedMessage(KEYS.log("g1"), 1, encode(line)))
+    made = _log_of(LoggedMessage(KEYS(keyspace.LOG, "g1"), 1, encode(line)))
     assert made is not None
     assert msgspec.json.decode(made) == {
         "timestamp": {"sec": 1, "nsec": 500_000_000},
@@ -106,12 +127,12 @@ def test_log_lines_become_foxglove_log() -> None:
         "file": "",
         "line": 0,
     }
-    assert _log_of(LoggedMessage(KEYS.log("g1"), 1, b"{")) is None
+    assert _log_of(LoggedMessage(KEYS(keyspace.LOG, "g1"), 1, b"{")) is None
 
 
 def test_notices_become_foxglove_log() -> None:
     """A notice to a person is in the log panel too, at its arrival when it has no time of its own."""
-    made = _log_of(LoggedMessage(KEYS.notice("ops"), 7, encode(Notice(id="n", to="ops", text="done"))))
+    made = _log_of(LoggedMessage(KEYS(keyspace.NOTICE, "ops"), 7, encode(Notice(id="n", to="ops", text="done"))))
     assert made is not None
     decoded = msgspec.json.decode(made)
     assert decoded["message"] == "to ops: done"

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from appliance.errors import ConfigError, RecordError
-from appliance.model import LogLine, encode
-from appliance.plane.keys import Keys
+from appliance.model import LogLine, encode, keyspace
+from appliance.model.keys import Keys
+from appliance.model.recorder_api import Gap, Incident
 from appliance.record.mcap_writer import LogFile
-from appliance.record.models import Gap, Incident, LoggedMessage
+from appliance.record.models import LoggedMessage
 from appliance.record.reader import info, read
 from appliance.record.segments import MOST_MARKS, LogWriter, file_prefix
 from appliance.record.settings import RecordConfig
@@ -66,7 +67,7 @@ class DiskFile(LogFile):
 
 
 def _message(number: int, size: int = 20) -> LoggedMessage:
-    return LoggedMessage(KEYS.transition("t1"), 1000 + number, encode({"n": number, "x": "y" * size}), JSON)
+    return LoggedMessage(KEYS(keyspace.TRANSITION, "t1"), 1000 + number, encode({"n": number, "x": "y" * size}), JSON)
 
 
 def _writer(folder: Path, clock: Clock | None = None, **changes: Any) -> LogWriter:
@@ -79,7 +80,9 @@ def _writer(folder: Path, clock: Clock | None = None, **changes: Any) -> LogWrit
 
 def _numbers(files: list[Path]) -> list[int]:
     return [
-        msgspec.json.decode(message.payload)["n"] for path in files for message in read(path, keys=KEYS.transition())
+        msgspec.json.decode(message.payload)["n"]
+        for path in files
+        for message in read(path, keys=KEYS(keyspace.TRANSITION))
     ]
 
 
@@ -87,7 +90,7 @@ def _gaps(files: list[Path]) -> list[Gap]:
     return [
         msgspec.json.decode(message.payload, type=Gap)
         for path in files
-        for message in read(path, keys=KEYS.recorder_gap("*"))
+        for message in read(path, keys=KEYS(keyspace.RECORDER_GAP, "*"))
     ]
 
 
@@ -99,9 +102,9 @@ def test_finished_file_is_valid_mcap(tmp_path: Path) -> None:
     """The mcap library's own indexed reader opens a finished file and finds schemas, statistics, times and metadata."""
     writer = _writer(tmp_path)
     line = LogLine(at_ns=5, level="info", source="gateway", event="started")
-    writer.write(LoggedMessage(KEYS.log("g1"), 5, encode(line), JSON))
-    writer.write(LoggedMessage(KEYS.mavlink("r1", "rx"), 6, b"\xfd\x09", "application/octet-stream"))
-    writer.write(LoggedMessage(KEYS.container("g1", "c1"), 7, b"", "", deleted=True))
+    writer.write(LoggedMessage(KEYS(keyspace.LOG, "g1"), 5, encode(line), JSON))
+    writer.write(LoggedMessage(KEYS(keyspace.MAVLINK, "r1", "rx"), 6, b"\xfd\x09", "application/octet-stream"))
+    writer.write(LoggedMessage(KEYS(keyspace.CONTAINER, "g1", "c1"), 7, b"", "", deleted=True))
     writer.close()
     with writer.files[0].open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
@@ -112,8 +115,8 @@ def test_finished_file_is_valid_mcap(tmp_path: Path) -> None:
         assert {schema.name for schema in summary.schemas.values()} >= {"swiftbot.LogLine", "foxglove.Log"}
         assert next(reader.iter_metadata()).metadata["fleet"] == "f1"
         found = [(channel.topic, message.log_time) for _, channel, message in reader.iter_messages()]
-    assert (KEYS.log("g1"), 5) in found
-    assert (KEYS.mavlink("r1", "rx"), 6) in found
+    assert (KEYS(keyspace.LOG, "g1"), 5) in found
+    assert (KEYS(keyspace.MAVLINK, "r1", "rx"), 6) in found
 
 
 def test_a_file_says_whose_it_is_and_what_its_frames_are(tmp_path: Path) -> None:
@@ -127,7 +130,7 @@ def test_a_file_says_whose_it_is_and_what_its_frames_are(tmp_path: Path) -> None
     }
     for folder, (changes, device) in written.items():
         writer = _writer(folder, **changes)
-        for key in (KEYS.mavlink("r1", "rx"), KEYS.link_frames("g1", "0", "tx")):
+        for key in (KEYS(keyspace.MAVLINK, "r1", "rx"), KEYS(keyspace.LINK_FRAMES, "g1", "0", "tx")):
             writer.write(LoggedMessage(key, 6, b"\xfd\x09", "application/mavlink"))
         writer.close()
         with writer.files[0].open("rb") as stream:
@@ -137,9 +140,12 @@ def test_a_file_says_whose_it_is_and_what_its_frames_are(tmp_path: Path) -> None
             assert summary is not None
             assert {each.compression for each in summary.chunk_indexes} == {"zstd"}
             told = {each.topic: each.metadata for each in summary.channels.values()}
-        assert told[KEYS.mavlink("r1", "rx")].items() >= {"dialect": "ardupilotmega", "direction": "rx"}.items()
         assert (
-            told[KEYS.link_frames("g1", "0", "tx")].items() >= {"dialect": "ardupilotmega", "direction": "tx"}.items()
+            told[KEYS(keyspace.MAVLINK, "r1", "rx")].items() >= {"dialect": "ardupilotmega", "direction": "rx"}.items()
+        )
+        assert (
+            told[KEYS(keyspace.LINK_FRAMES, "g1", "0", "tx")].items()
+            >= {"dialect": "ardupilotmega", "direction": "tx"}.items()
         )
 
 
@@ -147,16 +153,16 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     """Keys, times, payloads, encodings and deletions come back; copies made for Foxglove do not."""
     writer = _writer(tmp_path)
     messages = [
-        LoggedMessage(KEYS.log("g1"), 5, encode(LogLine(at_ns=5, level="info", source="a", event="b")), JSON),
-        LoggedMessage(KEYS.mavlink("r1", "tx"), 6, b"\xfd\x09", "zenoh/bytes"),
+        LoggedMessage(KEYS(keyspace.LOG, "g1"), 5, encode(LogLine(at_ns=5, level="info", source="a", event="b")), JSON),
+        LoggedMessage(KEYS(keyspace.MAVLINK, "r1", "tx"), 6, b"\xfd\x09", "zenoh/bytes"),
         LoggedMessage("swiftbot/f1/unheard/of", 7, b"", "text/plain"),
-        LoggedMessage(KEYS.container("g1", "c1"), 8, b"", "", deleted=True),
+        LoggedMessage(KEYS(keyspace.CONTAINER, "g1", "c1"), 8, b"", "", deleted=True),
     ]
     for message in messages:
         assert writer.write(message)
     writer.close()
     assert list(read(writer.files[0])) == messages
-    assert list(read(writer.files[0], keys=KEYS.container())) == [messages[3]]
+    assert list(read(writer.files[0], keys=KEYS(keyspace.CONTAINER))) == [messages[3]]
 
 
 def test_rotation_by_size(tmp_path: Path) -> None:
@@ -195,7 +201,7 @@ def test_rotation_by_time_and_by_channels(tmp_path: Path) -> None:
     clock.now += 61
     writer.tick()
     for number in range(1, 7):
-        writer.write(LoggedMessage(KEYS.transition(f"t{number}"), 5, encode({"n": number}), JSON))
+        writer.write(LoggedMessage(KEYS(keyspace.TRANSITION, f"t{number}"), 5, encode({"n": number}), JSON))
         writer.tick()
     writer.close()
     assert _numbers(writer.files) == list(range(7))
@@ -425,6 +431,6 @@ def test_hostile_times_are_replaced(tmp_path: Path) -> None:
     writer = _writer(tmp_path)
     writer._wall = lambda: 77
     for at_ns in (-5, 0, 2**70):
-        assert writer.write(LoggedMessage(KEYS.transition("t1"), at_ns, b"{}", JSON))
+        assert writer.write(LoggedMessage(KEYS(keyspace.TRANSITION, "t1"), at_ns, b"{}", JSON))
     writer.close()
     assert [message.at_ns for message in read(writer.files[0])] == [77, 77, 77]

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.model import LogLine, RunEvent, RunEventKind, encode
-from appliance.plane.keys import Keys
+from appliance.model import LogLine, RunEvent, RunEventKind, encode, keyspace
+from appliance.model.keys import Keys
 from appliance.record.models import LoggedMessage
 from appliance.record.reader import info
 from appliance.record.recorder import MOST_SOURCES, Pipeline, Sequences
@@ -27,25 +27,25 @@ def test_every_missing_number_is_counted(heard: set[int]) -> None:
     """Whichever of a speaker's numbers arrive, those missing in between are counted."""
     sequences = Sequences(KEYS)
     for number in sorted(heard):
-        sequences.heard("log", KEYS.log("g1"), b'{"number":%d}' % number)
+        sequences.heard("log", KEYS(keyspace.LOG, "g1"), b'{"number":%d}' % number)
     assert sequences.missing.get("log", 0) == max(heard) - min(heard) + 1 - len(heard)
 
 
 def test_speakers_are_told_apart() -> None:
-    """Another gateway, another attempt, a new coordinator, a process that counts anew: none of them is a hole."""
+    """Another gateway, another attempt, a new coordinator, a process that counts from one: none of them is a hole."""
     sequences = Sequences(KEYS)
     for key, payload in (
-        (KEYS.log("g1"), b'{"number":7}'),
-        (KEYS.log("g2"), b'{"number":3}'),
-        (KEYS.log("g1"), b'{"number":1}'),
+        (KEYS(keyspace.LOG, "g1"), b'{"number":7}'),
+        (KEYS(keyspace.LOG, "g2"), b'{"number":3}'),
+        (KEYS(keyspace.LOG, "g1"), b'{"number":1}'),
     ):
         assert sequences.heard("log", key, payload) is None
     for attempt, number in ((1, 1), (1, 2), (2, 1), (2, 2)):
         payload = b'{"attempt":%d,"number":%d}' % (attempt, number)
-        assert sequences.heard("run", KEYS.run("t", "s"), payload) is None
+        assert sequences.heard("run", KEYS(keyspace.RUN_EVENT, "t", "s"), payload) is None
     for coordinator, number in ((b"g1", 1), (b"g1", 2), (b"g2", 9), (b"g2", 10)):
         payload = b'{"sequence":%d,"coordinator":"%s"}' % (number, coordinator)
-        assert sequences.heard("transition", KEYS.transition("t"), payload) is None
+        assert sequences.heard("transition", KEYS(keyspace.TRANSITION, "t"), payload) is None
     assert sequences.missing == {}
 
 
@@ -56,12 +56,12 @@ def test_only_a_speakers_own_number_counts() -> None:
         line = LogLine(
             at_ns=1, level="info", source="g", event="x", fields={"number": 100 * number, "sequence": 1}, number=number
         )
-        assert sequences.heard("log", KEYS.log("g1"), encode(line)) is None
+        assert sequences.heard("log", KEYS(keyspace.LOG, "g1"), encode(line)) is None
         result = {"number": 7 * number, "attempt": number}
         event = RunEvent(task="t", subtask="s", attempt=1, kind=RunEventKind.PARTIAL, result=result, number=number)
-        assert sequences.heard("run", KEYS.run("t", "s"), encode(event)) is None
+        assert sequences.heard("run", KEYS(keyspace.RUN_EVENT, "t", "s"), encode(event)) is None
     unnumbered = LogLine(at_ns=1, level="info", source="g", event="x", fields={"number": 50})
-    assert sequences.heard("log", KEYS.log("g1"), encode(unnumbered)) is None
+    assert sequences.heard("log", KEYS(keyspace.LOG, "g1"), encode(unnumbered)) is None
     for payload in (
         b"",
         b"{",
@@ -71,18 +71,18 @@ def test_only_a_speakers_own_number_counts() -> None:
         b'{"number":-3}',
         b'{"number":' + b"9" * 30,
     ):
-        assert sequences.heard("log", KEYS.log("g1"), payload) is None
-    hole = sequences.heard("log", KEYS.log("g1"), b'{ "fields": {"number": 6}, "number" : 9 }')
+        assert sequences.heard("log", KEYS(keyspace.LOG, "g1"), payload) is None
+    hole = sequences.heard("log", KEYS(keyspace.LOG, "g1"), b'{ "fields": {"number": 6}, "number" : 9 }')
     assert hole is not None
     assert hole.missing == 3
 
 
 def test_frames_that_are_sent_have_no_holes() -> None:
-    """Of what a link sends each other end is told a part: what went to another one is not missing."""
+    """Of what a link sends each other end gets a part: what went to another one is not missing."""
     sequences = Sequences(KEYS)
-    for key in (KEYS.mavlink("r1", "tx"), KEYS.link_frames("g1", "0", "tx")):
+    for key in (KEYS(keyspace.MAVLINK, "r1", "tx"), KEYS(keyspace.LINK_FRAMES, "g1", "0", "tx")):
         assert sequences.kind_of(key) == ""
-    for key in (KEYS.mavlink("r1", "rx"), KEYS.link_frames("g1", "0", "rx")):
+    for key in (KEYS(keyspace.MAVLINK, "r1", "rx"), KEYS(keyspace.LINK_FRAMES, "g1", "0", "rx")):
         assert sequences.kind_of(key) == "mavlink"
 
 
@@ -90,7 +90,7 @@ def test_frames_that_are_sent_have_no_holes() -> None:
 def test_frames_count_in_a_byte(header: bytes) -> None:
     """The number after 255 is 0; a frame that was overtaken is no hole; components count for themselves."""
     sequences = Sequences(KEYS)
-    key = KEYS.mavlink("r1", "rx")
+    key = KEYS(keyspace.MAVLINK, "r1", "rx")
 
     def frame(number: int, component: int = 1) -> bytes:
         return header + bytes((number, 1, component)) + bytes(12)
@@ -109,7 +109,7 @@ def _heard(numbers: Iterable[int]) -> int:
     """Return how many frames are missing where these numbers come."""
     sequences = Sequences(KEYS)
     for number in numbers:
-        sequences.heard("mavlink", KEYS.mavlink("r1", "rx"), bytes((0xFE, 9, number % 256, 1, 1)) + bytes(12))
+        sequences.heard("mavlink", KEYS(keyspace.MAVLINK, "r1", "rx"), bytes((0xFE, 9, number % 256, 1, 1)) + bytes(12))
     return sequences.missing.get("mavlink", 0)
 
 
@@ -123,7 +123,7 @@ def test_frames_out_of_order_are_counted_once() -> None:
 
 @given(st.integers(0, 255), st.lists(st.integers(0, 20), max_size=30))
 def test_repetitions_are_no_holes(first: int, again: list[int]) -> None:
-    """However many of the last frames are told again, and when: nothing is missing of those that all came."""
+    """However many of the last frames are repeated, and when: nothing is missing of those that all came."""
     numbers: list[int] = []
     for number in range(60):
         numbers.append(first + number)
@@ -153,7 +153,7 @@ def test_holes_are_in_the_log_apart_from_what_was_dropped(tmp_path: Path) -> Non
     writer.prepare()
     pipeline = Pipeline(config, fleet="f1", writer=writer)
     for number in (1, 2, 6):
-        pipeline.write(LoggedMessage(KEYS.log("g1"), 5, _line(number), "application/json"))
+        pipeline.write(LoggedMessage(KEYS(keyspace.LOG, "g1"), 5, _line(number), "application/json"))
     pipeline.tick()
     writer.close()
     told = info(writer.files[0])

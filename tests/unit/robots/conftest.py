@@ -2,13 +2,14 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
 
 import msgspec
 import pytest
 
 from appliance.errors import UnreachableError
-from appliance.model import RobotCommand
-from appliance.plane.keys import Keys
+from appliance.model import RobotCommand, encode
+from appliance.model.keys import Keys, Topic
 from tests.unit.robots.flown import EVERY_S, Flown
 
 
@@ -21,13 +22,23 @@ class FakeSession:
         self.queries: list[bytes] = []
         self.answer: Callable[[bytes], Awaitable[bytes]] | None = None
         self.alive = False
+        self.credentials: Any = None
+
+    def publish(self, topic: Topic[Any], value: Any, *names: str) -> None:
+        """Put a fact."""
+        self.put(self.keys(topic, *names), encode(value))
 
     def put(self, key: str, payload: bytes, *, encoding: str = "application/json") -> None:  # noqa: ARG002
         """Keep a put."""
         self.puts.append((key, payload))
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:  # noqa: ARG002
-        """Answer as `answer` does."""
+    def publisher(self, key: str, encoding: str) -> "FakePublisher":
+        """Return a way to put a key."""
+        return FakePublisher(self, key, encoding)
+
+    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool) -> bytes:  # noqa: ARG002
+        """Answer as `answer` does; robots are asked with a signature only."""
+        assert sign
         self.queries.append(payload)
         if self.answer is None:
             raise UnreachableError(f"nobody answers {key}")
@@ -40,6 +51,20 @@ class FakeSession:
     def commanded(self) -> list[RobotCommand]:
         """Return the commands that were announced as taken up."""
         return [msgspec.json.decode(value, type=RobotCommand) for key, value in self.puts if key.endswith("/commanded")]
+
+
+class FakePublisher:
+    """Puts of one key."""
+
+    def __init__(self, session: FakeSession, key: str, encoding: str) -> None:
+        self._session, self._key, self._encoding = session, key, encoding
+
+    def put(self, payload: bytes) -> None:
+        """Keep a put."""
+        self._session.put(self._key, payload, encoding=self._encoding)
+
+    def close(self) -> None:
+        """Close."""
 
 
 class FakeStore:

@@ -23,7 +23,7 @@ class Flown:
         self.sent: list[Message] = []
         self.silent = False
         self.placed = False
-        """Its positions are told by the test alone (`tell`)."""
+        """Its positions come from the test alone (`tell`)."""
         self.standing = False
         """Whether time stands still for what flies; it answers and tells of itself all the same."""
         self._up, self._down = Codec(242, 191), Codec(1, 1)

@@ -13,11 +13,12 @@ from typing import Any, cast
 import msgspec
 
 from appliance.model import RobotInfo, Site, TaskRecord, TaskRequest
+from appliance.model.robot_api import MavlinkLink
 from appliance.ports import free_port
 from appliance.robots.mavlink.dialect import Codec, make
+from appliance.robots.mavlink.node import MavlinkNode
 from appliance.robots.mavlink.tunnel import MAX_PAYLOAD, PAYLOAD_TYPE
-from appliance.robots.mavlink.vehicle_manager import VehicleManager
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import RobotsConfig
 from appliance.robots.task_listener import Tasks
 from tests.unit.robots.conftest import FakeSession, FakeStore
 
@@ -55,9 +56,7 @@ class Wire(FakeSession):
 
 
 @asynccontextmanager
-async def station(
-    port: int, *more: MavlinkLink, **changes: Any
-) -> AsyncIterator[tuple[VehicleManager, dict[str, int]]]:
+async def station(port: int, *more: MavlinkLink, **changes: Any) -> AsyncIterator[tuple[MavlinkNode, dict[str, int]]]:
     """Open a station on a UDP port, with further links."""
     refused: dict[str, int] = {}
 
@@ -67,7 +66,7 @@ async def station(
     async def look(task: str) -> TaskRecord:
         return TaskRecord(id=task, instruction="")
 
-    made = VehicleManager(
+    made = MavlinkNode(
         RobotsConfig(mavlink=(MavlinkLink(listen=f"udp://127.0.0.1:{port}"), *more), **changes),
         session=cast("Any", Wire()),
         store=FakeStore(),
@@ -154,7 +153,7 @@ class Outside:
         closing.callback(server.close)
         return MavlinkLink(connect=f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
 
-    async def meet(self, made: VehicleManager, closing: AsyncExitStack) -> None:
+    async def meet(self, made: MavlinkNode, closing: AsyncExitStack) -> None:
         """Come to the gateway, or wait until it has come."""
         if self.kind == "udp listen":
             self._datagrams = await closing.enter_async_context(sender(self._port))
@@ -183,7 +182,7 @@ class Outside:
 @asynccontextmanager
 async def beside(
     kind: str, signing: str = "", **changes: Any
-) -> AsyncIterator[tuple[VehicleManager, dict[str, int], Outside, Callable[[bytes], None]]]:
+) -> AsyncIterator[tuple[MavlinkNode, dict[str, int], Outside, Callable[[bytes], None]]]:
     """Open a station with a link of that kind, whose other end the test has, and another link with a vehicle."""
     port, outside = free_port(socket.SOCK_DGRAM), Outside(kind)
     async with AsyncExitStack() as closing:
@@ -204,7 +203,7 @@ def tunnel_of(codec: Codec, payload: bytes) -> bytes:
     )  # fmt: skip
 
 
-async def understood(made: VehicleManager, outside: Outside, system: int = 78) -> None:
+async def understood(made: MavlinkNode, outside: Outside, system: int = 78) -> None:
     """Wait until a frame is heard from this end."""
     codec = Codec(system, 1)
     await until(
@@ -213,7 +212,7 @@ async def understood(made: VehicleManager, outside: Outside, system: int = 78) -
     )
 
 
-async def served(made: VehicleManager, vehicle: Callable[[bytes], None], outside: Outside) -> None:
+async def served(made: MavlinkNode, vehicle: Callable[[bytes], None], outside: Outside) -> None:
     """Wait until a vehicle on another link is a robot, while this one brings what it has left."""
     codec = Codec(77, 1)
 
@@ -221,10 +220,10 @@ async def served(made: VehicleManager, vehicle: Callable[[bytes], None], outside
         vehicle(codec.pack(make("HEARTBEAT", **BEAT)))
         outside.write()
 
-    await until(lambda: "drone_77" in made.attached, act)
+    await until(lambda: "drone_77" in made.vehicles.attached, act)
 
 
-def states_told(made: VehicleManager) -> list[RobotInfo]:
+def states_told(made: MavlinkNode) -> list[RobotInfo]:
     """Return what was told of robots, in order."""
     session = cast("Wire", made._session)
     return [msgspec.json.decode(value, type=RobotInfo) for key, value in session.puts if key.endswith("/state")]

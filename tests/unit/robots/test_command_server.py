@@ -261,7 +261,7 @@ async def test_two_commands_in_one_burst(fleet: Fleet) -> None:
 
 
 async def test_a_crowd_of_senders(fleet: Fleet) -> None:
-    """Beyond a bound of requests at work the next senders are told to ask again, and are counted; nobody is lost."""
+    """Beyond a bound of requests at work the next senders have to ask again, and are counted; nobody is lost."""
     fleet.gate.clear()
     for system in range(1, MAX_AT_WORK + 4):
         fleet.send(param1=1.0, source=(system, 190))
@@ -276,7 +276,7 @@ async def test_a_crowd_of_senders(fleet: Fleet) -> None:
 
 
 async def test_how_it_goes_on_is_told(fleet: Fleet) -> None:
-    """Each change is told once, long reasons in parts that belong together, and nothing of others' tasks."""
+    """Each change is sent once, long reasons in parts that belong together, and nothing of others' tasks."""
     fleet.send(param1=1.0)
     await fleet.answered(2)
     task = fleet.submitted[0].id
@@ -304,7 +304,7 @@ async def _later(fleet: Fleet, now: float) -> None:
 
 
 async def test_how_it_goes_on_is_told_after_a_restart(fleet: Fleet) -> None:
-    """Once its sender is heard again it is told how its task stands, then each change; its end once, over restarts."""
+    """Once its sender is heard again it hears how its task stands, then each change; its end once, over restarts."""
     fleet.send(param1=1.0)
     await fleet.answered(2)
     task = fleet.submitted[0].id

@@ -165,7 +165,7 @@ async def test_a_pilot_who_takes_it_as_it_is_armed_keeps_it(
 async def test_a_pilot_who_takes_it_keeps_its_gimbal(
     flown: Flown, monkeypatch: pytest.MonkeyPatch, args: GimbalArgs, number: int
 ) -> None:
-    """What turns a gimbal may turn its vehicle: once a pilot has taken over it is not sent again, nor anew."""
+    """What turns a gimbal may turn its vehicle: once a pilot has taken over it is sent no more."""
     real = orders.answer
 
     def answer(vehicle: Any, message: Message, sender: Any) -> list[Message]:

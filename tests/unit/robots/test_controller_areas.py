@@ -64,7 +64,7 @@ def _past_the_corner(every_s: float, *, first_s: float = 0.0, missing: Container
         pytest.param(_past_the_corner(1.0, first_s=0.5), id="1 Hz, none at the corner"),
         pytest.param([(-3.0, 5.0, 1000.0), (5.0, -3.0, 1003.0)], id="an outage of 3 s"),
         pytest.param([(-3.0, 20.0, 1000.0), (43.0, 20.0, 1030.0)], id="the other side after an outage"),
-        pytest.param([(-3.0, 20.0, 1000.0), (43.0, 20.0, 1.0)], id="a clock that began anew"),
+        pytest.param([(-3.0, 20.0, 1000.0), (43.0, 20.0, 1.0)], id="a clock that began again"),
     ],
 )
 async def test_a_gap_in_the_positions_is_no_flight_through_an_area(flown: Flown, told: Told) -> None:

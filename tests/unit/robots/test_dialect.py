@@ -168,7 +168,7 @@ def test_signed_frames_are_refused_and_the_next_is_read() -> None:
 
 
 def test_numbers_have_names() -> None:
-    """Enum values are told by name, unknown ones by number."""
+    """Enum values are shown by name, unknown ones by number."""
     assert label("MAV_RESULT", constant("MAV_RESULT_DENIED")) == "MAV_RESULT_DENIED"
     assert label("MAV_RESULT", 77) == "77"
     assert label("NO_SUCH", 1) == "1"

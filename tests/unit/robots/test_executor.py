@@ -237,7 +237,7 @@ async def test_a_robot_that_is_not_ready_takes_nothing_up(robot: Robot) -> None:
 
 
 async def test_losing_the_robot_fails_what_is_under_way(robot: Robot) -> None:
-    """`fail_all` answers every running command with that failure, and the next attempt does it anew."""
+    """`fail_all` answers every running command with that failure, and the next attempt does it again."""
     going = await robot.begin(order("t/s1/1"))
     gone = Failure(code="robot", message="gone", retryable=True)
     await robot.desk.fail_all(gone)
@@ -350,7 +350,7 @@ async def test_giving_up_stops_the_robot(session: Any, how: str) -> None:
 async def test_a_robot_that_is_there_and_does_not_answer_breaks_the_contract(
     session: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The error says which robot, which verb, how long and how often; it is told to stop, and has a check."""
+    """The error says which robot, which verb, how long and how often; it gets a stop, and has a check."""
     monkeypatch.setattr(retry, "UNREACHABLE_S", 0.5)
     session.alive = True
     with pytest.raises(ContractError, match=r"robot r did not answer goto for \d s \(asked \d times\)") as caught:

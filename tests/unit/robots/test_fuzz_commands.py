@@ -35,7 +35,7 @@ class Order(Struct, frozen=True):
         return common | rest | {"confirmation": confirmation}
 
     def key(self) -> tuple[bool, int, bytes, int]:
-        """Return by what it is told from others: its bytes, NaN included."""
+        """Return what distinguishes it from others: its bytes, NaN included."""
         used = (*self.numbers[:4], self.numbers[6]) if self.whole else self.numbers
         return (self.whole, self.system, struct.pack(f"<{len(used)}f", *used), self.x if self.whole else 0)
 

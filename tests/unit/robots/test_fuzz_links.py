@@ -86,7 +86,7 @@ async def test_an_end_that_brings_anything(kind: str, brought: list[bytes]) -> N
     """Random bytes, good frames with random payloads, tunnels that lie: the others are served, and it is understood."""
     async with beside(kind) as (made, refused, outside, vehicle):
         outside.write(Codec(255, 190).pack(make("HEARTBEAT", **STATION)), *brought)
-        # A stranger may have taken the vehicle's name before: then both are told apart, and that is counted.
+        # A stranger may have taken the vehicle's name before: then both are distinguished, and that is counted.
         await served(made, vehicle, outside)
         # Behind all that a stream is understood again: at the latest when the longest frame that it may have begun
         # is at its end.
@@ -130,12 +130,12 @@ async def test_what_is_none_is_counted(kind: str) -> None:
             lambda: refused.get("mission_refused", 0) > before,
             lambda: outside.write(codec.pack(make("MISSION_COUNT", count=65_535, **target))),
         )
-        await until(lambda: not made._switch._missions._uploads)
+        await until(lambda: not made.companion._missions._uploads)
         # More parts than any message may have: refused, and nothing of it is kept.
         for _ in range(200):
             outside.write(tunnel_of(codec, _part(index=7, count=65_535, data=bytes(112))))
         await understood(made, outside, system=79)
-        channel = made._switch._letters._senders[255, 190].channel
+        channel = made.companion._tunnel._senders[255, 190].channel
         assert not channel._coming
         assert len(channel._refusals) <= MAX_GOING
         await served(made, vehicle, outside)
@@ -152,7 +152,7 @@ async def test_a_flood_on_one_link(kind: str) -> None:
             vehicle(codec.pack(make("HEARTBEAT", **BEAT)))
 
         counted = "flood" if kind.startswith("udp") else "slowed"
-        await until(lambda: "drone_77" in made.attached and refused.get(counted, 0) > 0, both)
+        await until(lambda: "drone_77" in made.vehicles.attached and refused.get(counted, 0) > 0, both)
 
 
 def _storm(chance: random.Random, count: int) -> list[tuple[bytes, tuple[str, int]]]:
@@ -209,7 +209,7 @@ async def test_a_flood_of_everything_costs_no_memory() -> None:
                 for raw, address in _storm(chance, 1000):
                     entry.link.feed(raw, address)
                 for _ in range(50):
-                    made._switch.tick(asyncio.get_running_loop().time())
+                    made.companion.tick(asyncio.get_running_loop().time())
                     await asyncio.sleep(0)
                 session.puts.clear()
                 gc.collect()

@@ -154,7 +154,7 @@ commands = st.fixed_dictionaries(
 
 @given(st.one_of(commands.map(as_json), payloads))
 async def test_any_command_is_answered_or_refused(payload: bytes) -> None:
-    """Never carried out with arguments that are none, and never a crash of whoever serves it."""
+    """Never carried out with arguments that are none, and never a crash of its server."""
     from tests.unit.robots.conftest import FakeSession, FakeStore  # noqa: PLC0415 - one for each example
 
     robot = Robot(FakeSession(), FakeStore())

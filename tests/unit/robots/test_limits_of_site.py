@@ -132,7 +132,7 @@ def _round_the_corner(metres: float) -> Pose:
 @pytest.mark.parametrize("every_s", [0.1, 0.2, 0.4, 0.5, 0.8, 1.0, 3.0])
 @pytest.mark.parametrize("speed_mps", [1.0, 5.0, 8.0, 15.0])
 def test_a_corner_that_is_flown_round_is_not_flown_through(every_s: float, speed_mps: float) -> None:
-    """However seldom the position is told, and wherever on the way: 0.2 s are 5 Hz, 0.8 s are three of those lost."""
+    """However rare positions are, and wherever on the way: 0.2 s are 5 Hz, 0.8 s are three of those lost."""
     step = speed_mps * every_s
     for begun in range(20):
         at = [begun / 20 * step + number * step for number in range(math.ceil(60.0 / step))]

@@ -9,25 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.model import Site
+from appliance.model import Site, keyspace
+from appliance.model.robot_api import MavlinkLink
 from appliance.ports import free_port
 from appliance.robots.mavlink.dialect import Codec, Frame, make
+from appliance.robots.mavlink.node import MavlinkNode
 from appliance.robots.mavlink.signing import Signer
-from appliance.robots.mavlink.vehicle_manager import VehicleManager
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import RobotsConfig
 from tests.unit.robots.conftest import FakeStore
-from tests.unit.robots.links import (
-    BEAT,
-    KEY,
-    LINKS,
-    STATION,
-    Wire,
-    beside,
-    sender,
-    states_told,
-    station,
-    until,
-)
+from tests.unit.robots.links import BEAT, KEY, LINKS, STATION, Wire, beside, sender, states_told, station, until
 
 pytestmark = pytest.mark.anyio
 
@@ -46,7 +36,7 @@ async def test_signed_frames_that_are_played_again(kind: str, tmp_path: Any) -> 
             recorded.append(codec.pack(make("HEARTBEAT", **BEAT)))
             outside.write(recorded[-1])
 
-        await until(lambda: made.attached == ("drone_1",), beat)
+        await until(lambda: made.vehicles.attached == ("drone_1",), beat)
         assert "replayed" not in refused
         outside.write(*recorded)
         await until(lambda: refused.get("replayed", 0) == len(recorded), outside.write)
@@ -54,7 +44,7 @@ async def test_signed_frames_that_are_played_again(kind: str, tmp_path: Any) -> 
         await until(lambda: refused.get("bad_signature"), lambda: outside.write(forger.pack(make("HEARTBEAT", **BEAT))))
         plain = Codec(2, 1)
         await until(lambda: refused.get("unsigned"), lambda: outside.write(plain.pack(make("HEARTBEAT", **BEAT))))
-        assert made.attached == ("drone_1",)
+        assert made.vehicles.attached == ("drone_1",)
 
 
 @pytest.mark.parametrize("kind", LINKS)
@@ -62,7 +52,7 @@ async def test_two_vehicles_with_one_system_id_on_two_links(kind: str) -> None:
     """The first one is believed; what says the same on another link is counted, and its place is not taken."""
     async with beside(kind) as (made, refused, outside, vehicle):
         one, two = Codec(1, 1), Codec(1, 1)
-        await until(lambda: made.attached, lambda: vehicle(one.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: made.vehicles.attached, lambda: vehicle(one.pack(make("HEARTBEAT", **BEAT))))
         two._mav.seq = 100
 
         def both() -> None:
@@ -70,18 +60,18 @@ async def test_two_vehicles_with_one_system_id_on_two_links(kind: str) -> None:
             outside.write(two.pack(make("HEARTBEAT", **(BEAT | {"custom_mode": 9, "base_mode": 128}))))
 
         await until(lambda: refused.get("name_conflict", 0) > 5, both)
-        assert made.attached == ("drone_1",)
+        assert made.vehicles.attached == ("drone_1",)
         assert {(each.mode, each.armed) for each in states_told(made)} <= {("GUIDED", False)}
 
 
 @settings(max_examples=5)
 @given(st.lists(st.booleans(), min_size=10, max_size=60))
 async def test_two_vehicles_with_one_system_id_in_any_order(order: list[bool]) -> None:
-    """However their frames mix: what is told of the robot is what the first one says, and the other is counted."""
+    """However their frames mix: what is published of the robot is what the first one says, and the other is counted."""
     port = free_port(socket.SOCK_DGRAM)
     async with station(port) as (made, refused), sender(port) as first, sender(port) as second:
         one, two = Codec(1, 1), Codec(1, 1)
-        await until(lambda: made.attached, lambda: first(one.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: made.vehicles.attached, lambda: first(one.pack(make("HEARTBEAT", **BEAT))))
         two._mav.seq = 100
         for mine in (*order, False):
             if mine:
@@ -98,7 +88,7 @@ async def test_two_vehicles_with_one_system_id() -> None:
     port = free_port(socket.SOCK_DGRAM)
     async with station(port) as (made, refused), sender(port) as first, sender(port) as second:
         one, two = Codec(1, 1), Codec(1, 1)
-        await until(lambda: made.attached, lambda: first(one.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: made.vehicles.attached, lambda: first(one.pack(make("HEARTBEAT", **BEAT))))
         two._mav.seq = 100
 
         def both() -> None:
@@ -106,12 +96,12 @@ async def test_two_vehicles_with_one_system_id() -> None:
             second(two.pack(make("HEARTBEAT", **(BEAT | {"custom_mode": 9}))))
 
         await until(lambda: refused.get("address_conflict", 0) > 5, both)
-        assert made.attached == ("drone_1",)
+        assert made.vehicles.attached == ("drone_1",)
 
 
 @pytest.mark.parametrize(("signed", "followed"), [(False, True), (True, False)], ids=["unsigned", "signed"])
 async def test_a_silent_vehicle_is_followed_to_another_link(signed: bool, followed: bool, tmp_path: Any) -> None:
-    """But not from a link with a key to one without: whoever jams the first would have its name."""
+    """But not from a link with a key to one without: one that jams the first would have its name."""
     key = tmp_path / "key"
     key.write_text("hex:" + KEY.hex())
     key.chmod(0o600)
@@ -125,20 +115,20 @@ async def test_a_silent_vehicle_is_followed_to_another_link(signed: bool, follow
         codec = Codec(1, 1, signer=Signer(KEY, link_id=1) if signed else None)
         plain = Codec(1, 1)
         plain._mav.seq = 100
-        await until(lambda: made.online("drone_1"), lambda: radio(codec.pack(make("HEARTBEAT", **BEAT))))
-        await until(lambda: not made.online("drone_1"))
+        await until(lambda: made.vehicles.online("drone_1"), lambda: radio(codec.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: not made.vehicles.online("drone_1"))
         beat = lambda: wifi(plain.pack(make("HEARTBEAT", **BEAT)))  # noqa: E731 - said twice
         if followed:
-            await until(lambda: made.online("drone_1"), beat)
+            await until(lambda: made.vehicles.online("drone_1"), beat)
             assert "name_conflict" not in refused
         else:
             await until(lambda: refused.get("name_conflict", 0) > 3, beat)
-            assert not made.online("drone_1")
-            await until(lambda: made.online("drone_1"), lambda: radio(codec.pack(make("HEARTBEAT", **BEAT))))
+            assert not made.vehicles.online("drone_1")
+            await until(lambda: made.vehicles.online("drone_1"), lambda: radio(codec.pack(make("HEARTBEAT", **BEAT))))
 
 
 async def test_an_end_that_understands_mavlink_1_alone() -> None:
-    """It is a vehicle like others: what it is told, by the gateway or from another link, is in MAVLink 1."""
+    """It is a vehicle like others: what it is sent, by the gateway or from another link, is in MAVLink 1."""
     port, other = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
     heard: list[bytes] = []
 
@@ -153,7 +143,7 @@ async def test_an_end_that_understands_mavlink_1_alone() -> None:
         transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(Old, remote_addr=("127.0.0.1", port))
         try:
             codec, watching = Codec(5, 1, v1=True), Codec(255, 190)
-            await until(lambda: made.attached, lambda: transport.sendto(codec.pack(make("HEARTBEAT", **BEAT))))
+            await until(lambda: made.vehicles.attached, lambda: transport.sendto(codec.pack(make("HEARTBEAT", **BEAT))))
             asked = make("COMMAND_INT", target_system=5, target_component=1, frame=3, command=192, current=0,
                          autocontinue=0, param1=0, param2=0, param3=0, param4=0, x=7, y=8, z=0)  # fmt: skip
             tunnel = {"payload_type": 1, "payload_length": 0, "payload": [0] * 128}
@@ -186,7 +176,7 @@ async def test_a_repetition_is_recorded_and_goes_no_further() -> None:
         sender(other) as ground,
     ):
         codec, watching = Codec(1, 1), Codec(255, 190)
-        await until(lambda: made.attached, lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: made.vehicles.attached, lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))))
         await until(lambda: made.link_list().routes.get("255/190"), lambda: ground(_watch(watching)))
         said, asked = codec.pack(make("HEARTBEAT", **(BEAT | {"custom_mode": 5}))), _watch(watching)
         session = cast("Wire", made._session)
@@ -198,10 +188,10 @@ async def test_a_repetition_is_recorded_and_goes_no_further() -> None:
         await until(lambda: told(said) > 2 and told(asked) > 2, lambda: (vehicle(said), ground(asked)))
         assert refused["repeated"] == told(said) + told(asked) - 2
         heard = [key for key, payload in session.puts if payload == said and key.endswith("/rx")]
-        assert set(heard) == {keys.mavlink("drone_1", "rx")}
+        assert set(heard) == {keys(keyspace.MAVLINK, "drone_1", "rx")}
         assert sum(key.endswith("/tx") for key, payload in session.puts if payload == said) == 1
         heard = [key for key, payload in session.puts if payload == asked and key.endswith("/rx")]
-        assert set(heard) == {keys.link_frames("gw-1", "1", "rx")}
+        assert set(heard) == {keys(keyspace.LINK_FRAMES, "gw-1", "1", "rx")}
         assert sum(key.endswith("/tx") for key, payload in session.puts if payload == asked) == 1
 
 
@@ -219,7 +209,7 @@ async def test_a_recorded_signed_link_played_again(tmp_path: Any) -> None:
     recorded: list[bytes] = []
     for _ in range(2):
         refused: dict[str, int] = {}
-        made = VehicleManager(
+        made = MavlinkNode(
             RobotsConfig(mavlink=(MavlinkLink(listen=f"udp://127.0.0.1:{port}", signing=str(key)),), repeat_s=0.0),
             session=cast("Any", Wire()), store=store, gateway="gw-1", site=Site(), refused=refused,
         )  # fmt: skip
@@ -229,13 +219,13 @@ async def test_a_recorded_signed_link_played_again(tmp_path: Any) -> None:
             for raw in recorded:
                 attacker(raw)
             await until(lambda refused=refused, before=before: refused.get("replayed", 0) == before)
-            assert not made.attached
+            assert not made.vehicles.attached
 
             def beat(vehicle: Callable[[bytes], None] = vehicle) -> None:
                 raw = codec.pack(make("HEARTBEAT", **BEAT))
                 recorded.append(raw)
                 vehicle(raw)
 
-            await until(lambda made=made: made.attached, beat)
+            await until(lambda made=made: made.vehicles.attached, beat)
         await made.stop()
     assert len(store.values[f"mavlink/signing/udp://127.0.0.1:{port}"]) < 2000

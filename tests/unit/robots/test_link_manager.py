@@ -1,4 +1,5 @@
 """Links that come and go at run time: over real loopback sockets and pseudo-terminals, kept over a restart."""
+# pyright: reportDeprecated=false, reportUnknownArgumentType=false, reportUnknownLambdaType=false
 
 import asyncio
 import os
@@ -9,11 +10,12 @@ from contextlib import asynccontextmanager
 import pytest
 
 from appliance.errors import ConfigError, NotFoundError, RefusedError
+from appliance.model.robot_api import MavlinkLink, read_remote
 from appliance.robots.mavlink.dialect import Codec, Damage, Frame, make
-from appliance.robots.mavlink.link_manager import KEY, LinkManager, OpenLink, rules_of
+from appliance.robots.mavlink.link_manager import KEY, LinkManager, message_names, rules_of
 from appliance.robots.mavlink.links import Address
 from appliance.robots.mavlink.routing import RoutingTable
-from appliance.robots.settings import MavlinkLink, RobotsConfig, read_remote
+from appliance.robots.settings import RobotsConfig
 from tests.unit.robots.conftest import FakeStore
 
 pytestmark = pytest.mark.anyio
@@ -26,21 +28,16 @@ class Bench:
 
     def __init__(self, store: FakeStore, config: RobotsConfig) -> None:
         self.heard: list[tuple[int, str, Address]] = []
-        self.gone: list[str] = []
         self.refused: dict[str, int] = {}
-        self.router = RoutingTable(own_system=245)
-        self.table = LinkManager(
-            config,
-            store=store,
-            router=self.router,
-            on_frame=self._take,
-            on_gone=lambda entry: self.gone.append(str(entry.setting.remote)),
-            refused=self.refused,
-        )
+        self.busy = False
+        self.table = LinkManager(config, store=store, routing=RoutingTable(own_system=245), refused=self.refused)
 
-    def _take(self, entry: OpenLink, frame: Frame, address: Address) -> None:
+    def receive(self, link: int, frame: Frame, address: Address) -> None:
+        """Take a frame."""
+        entry = self.table.get(link)
+        assert entry is not None
         entry.link.stats.sender(frame.system, frame.component).hear(frame.sequence, 0.0)
-        self.heard.append((entry.number, frame.name, address))
+        self.heard.append((link, frame.name, address))
 
     @property
     def urls(self) -> list[str]:
@@ -52,7 +49,7 @@ class Bench:
 async def opened(store: FakeStore, *links: MavlinkLink, **changes: float) -> AsyncIterator[Bench]:
     """Open a table of such a configuration."""
     bench = Bench(store, RobotsConfig(mavlink=links, **changes))  # pyright: ignore[reportArgumentType]
-    await bench.table.open()
+    await bench.table.open(bench)
     try:
         yield bench
     finally:
@@ -82,7 +79,7 @@ async def test_added_and_removed_links_outlive_a_restart(
         await bench.table.remove(one, by="a test")
         with pytest.raises(NotFoundError, match=two):
             await bench.table.remove(one, by="a test")
-        assert (bench.urls, bench.gone) == ([two, three], [one])
+        assert bench.urls == [two, three]
     async with opened(store, *configured) as bench:
         assert bench.urls == [two, three]
         assert [each.setting.prefix for each in bench.table] == ["drone_", "boat_"]
@@ -94,7 +91,7 @@ async def test_added_and_removed_links_outlive_a_restart(
 
 
 async def test_what_was_kept_cannot_stop_a_gateway(store: FakeStore, free_ports: Callable[..., list[int]]) -> None:
-    """Kept links that cannot be read, or whose port is taken by now, are told in the log; the others are open."""
+    """Kept links that cannot be read, or whose port is taken by now, are reported in the log; the others are open."""
     one, two = (f"tcp://127.0.0.1:{port}" for port in free_ports(2))
     async with opened(store) as bench:
         await bench.table.add(MavlinkLink(listen=one), by="a test")
@@ -219,7 +216,7 @@ async def test_a_flood_from_one_sender(store: FakeStore, free_ports: Callable[..
 
 
 async def test_a_stream_is_slowed_not_cut(store: FakeStore, free_ports: Callable[..., list[int]]) -> None:
-    """Over TCP whoever sends too fast is read more slowly: every frame arrives."""
+    """Over TCP a sender that is too fast is read more slowly: every frame arrives."""
     (port,) = free_ports(1)
     async with opened(store, MavlinkLink(listen=f"tcp://127.0.0.1:{port}"), sender_hz=500.0) as bench:
         _, writer = await asyncio.open_connection("127.0.0.1", port)
@@ -231,3 +228,60 @@ async def test_a_stream_is_slowed_not_cut(store: FakeStore, free_ports: Callable
         assert bench.table.all_facts()[0].senders[0].lost == 0
         writer.close()
         await writer.wait_closed()
+
+
+def test_a_message_that_vehicles_share_is_one() -> None:
+    """Messages are named in either case or by number; a name that is none is an error that names the setting."""
+    assert message_names("robots.vehicles_share", ("adsb_vehicle", "247")) == {"ADSB_VEHICLE", "COLLISION"}
+    with pytest.raises(ConfigError, match=r"robots.vehicles_share: 'ADSB' is no MAVLink message"):
+        message_names("robots.vehicles_share", ("ADSB",))
+
+
+@pytest.mark.parametrize(
+    ("link", "named"),
+    [
+        (MavlinkLink(listen="udp://0.0.0.0:14550"), "udp://0.0.0.0:14550"),
+        (MavlinkLink(connect="tcp://10.0.0.7:5760"), "tcp://10.0.0.7:5760"),
+        (MavlinkLink(listen="udp://drones.example:14550"), "drones.example"),
+        (MavlinkLink(listen="udp://[::]:14550", mavlink1=True), "[::]"),
+    ],
+)
+def test_a_gateway_with_keys_takes_no_unsigned_link_that_others_reach(link: MavlinkLink, named: str) -> None:
+    """The error names the link and what to set."""
+    with pytest.raises(ConfigError, match="is not signed") as told:
+        link.check_keyed()
+    assert named in told.value.message
+    assert "signing" in told.value.remedy
+
+
+@pytest.mark.parametrize(
+    "link",
+    [
+        MavlinkLink(),
+        MavlinkLink(listen="udp://127.0.0.1:14550"),
+        MavlinkLink(connect="tcp://[::1]:5760"),
+        MavlinkLink(connect="tcp://localhost:5760"),
+        MavlinkLink(connect="serial:/dev/ttyUSB0:57600"),
+        MavlinkLink(listen="udp://0.0.0.0:14550", signing="credential:mavlink"),
+    ],
+)
+def test_signed_links_cables_and_the_loopback_need_no_more(link: MavlinkLink) -> None:
+    """Nobody beyond the machine reaches them without the key."""
+    link.check_keyed()
+
+
+async def test_links_added_while_it_runs_are_held_to_it_too(
+    store: FakeStore, free_ports: Callable[..., list[int]]
+) -> None:
+    """Also one that was added before the gateway had keys: it is left out, and the gateway comes up."""
+    (port,) = free_ports(1, udp=True)
+    link = MavlinkLink(listen=f"udp://0.0.0.0:{port}")
+    async with opened(store) as bench:
+        await bench.table.add(link, by="ann")
+    routing = RoutingTable(own_system=245)
+    keyed = LinkManager(RobotsConfig(), store=store, routing=routing, refused={}, keyed=True)
+    await keyed.open(Bench(store, RobotsConfig()))
+    assert len(keyed) == 0
+    with pytest.raises(ConfigError, match="is not signed"):
+        await keyed.add(link, by="ann")
+    await keyed.close()

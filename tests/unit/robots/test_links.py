@@ -7,9 +7,9 @@ from contextlib import asynccontextmanager
 import pytest
 
 from appliance.errors import ConfigError
+from appliance.model.robot_api import Remote, read_remote
 from appliance.robots.mavlink.dialect import Codec, Frame, make
 from appliance.robots.mavlink.links import Address, Link, open_link
-from appliance.robots.settings import Remote, read_remote
 
 pytestmark = pytest.mark.anyio
 
@@ -21,6 +21,7 @@ class End:
 
     def __init__(self) -> None:
         self.heard: list[tuple[int, Address]] = []
+        self.busy = False
         self.link: Link
 
     @classmethod
@@ -28,15 +29,16 @@ class End:
     async def open(cls, remote: Remote, system: int) -> AsyncIterator["End"]:
         """Open a link of a system."""
         end = cls()
-
-        def take(frame: Frame, address: Address) -> None:
-            end.heard.append((frame.system, address))
-
-        end.link = await open_link(remote, Codec(system, 1), take)
+        end.link = await open_link(remote, Codec(system, 1), end)
         try:
             yield end
         finally:
             await end.link.close()
+
+    def receive(self, link: int, frame: Frame, address: Address) -> None:
+        """Take a frame."""
+        del link
+        self.heard.append((frame.system, address))
 
     def beat(self) -> None:
         """Send a heartbeat to every other end that is known."""
@@ -116,5 +118,5 @@ async def test_a_port_that_is_taken(scheme: str) -> None:
     async with End.open(read_remote(f"{scheme}://127.0.0.1:0", listens=True), 1) as first:
         port = first.link.address[1]
         with pytest.raises(ConfigError, match=f"{scheme}://127.0.0.1:{port}") as told:
-            await open_link(read_remote(f"{scheme}://127.0.0.1:{port}", listens=True), Codec(2, 1), lambda *_: None)
+            await open_link(read_remote(f"{scheme}://127.0.0.1:{port}", listens=True), Codec(2, 1), End())
         assert "another robots.mavlink listen" in told.value.remedy

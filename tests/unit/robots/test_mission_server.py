@@ -158,7 +158,7 @@ async def test_what_a_mission_means() -> None:
 
 
 async def test_a_mission_of_more_subtasks_than_a_plan_may_have_is_refused_at_its_upload(store: FakeStore) -> None:
-    """Not when it is started: the ground station is told the limit and to split it, and nothing is held."""
+    """Not when it is started: the ground station hears the limit and to split it, and nothing is held."""
     ground = Ground(store)
     turns = [item(TURNS, 12, 12, 8, 2.0, 0.0, 5.0) for _ in range(65)]
     assert await ground.upload([MISSION[0], *turns]) == NO_SPACE
@@ -304,7 +304,7 @@ async def test_what_is_no_upload(store: FakeStore) -> None:
 
 
 async def test_an_upload_that_is_left_is_given_up(store: FakeStore) -> None:
-    """An item that does not come is asked for as often as is set, then the sender is told, and another may begin."""
+    """An item that does not come is asked for as often as is set, then the sender hears so, and another may begin."""
     ground = Ground(store, tries=4, ack_timeout_s=0.5)
     ground.tell("MISSION_COUNT", count=3)
     for _ in range(60):

@@ -11,10 +11,10 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega
 
 from appliance.errors import NotFoundError, RefusedError
-from appliance.model import RobotInfo
+from appliance.model import RobotInfo, Site
+from appliance.model.robot_api import RobotForget
 from appliance.plane.registry import Roster
 from appliance.ports import free_port
-from appliance.robots.api import RobotForget
 from appliance.robots.hub import RobotHub
 from appliance.robots.mavlink.dialect import VEHICLES, Codec, frame_length, label, make
 from appliance.robots.settings import RobotsConfig
@@ -36,9 +36,9 @@ async def test_no_sender_that_is_none_makes_a_robot(kind: str) -> None:
             outside.write(*(each.pack(make("HEARTBEAT", **BEAT)) for each in codecs))
             vehicle(real.pack(make("HEARTBEAT", **BEAT)))
 
-        await until(lambda: made.attached and refused.get("no_sender", 0) > 5, act)
-        assert made.attached == ("drone_77",)
-        assert not [each for each in made._switch.router.routes if each[0] == 0]
+        await until(lambda: made.vehicles.attached and refused.get("no_sender", 0) > 5, act)
+        assert made.vehicles.attached == ("drone_77",)
+        assert not [each for each in made.routing.routes if each[0] == 0]
         assert all(each.system for link in made.link_list().links for each in link.senders)
 
 
@@ -71,9 +71,9 @@ async def test_components_that_name_an_autopilot_make_no_robot(kind: str) -> Non
             for codec, each in codecs.items():
                 vehicle(codec.pack(make("HEARTBEAT", **(BEAT | {"type": each}))))
 
-        await until(lambda: len(made.attached) >= len(VEHICLES), act)
-        await until(lambda: len(made._guests) >= len(frames), act)
-        assert {int(each.removeprefix("drone_")) for each in made.attached} == {each.system for each in codecs}
+        await until(lambda: len(made.vehicles.attached) >= len(VEHICLES), act)
+        await until(lambda: len(made.vehicles._guests) >= len(frames), act)
+        assert {int(each.removeprefix("drone_")) for each in made.vehicles.attached} == {each.system for each in codecs}
 
 
 async def test_a_vehicle_is_not_made_a_gimbal() -> None:
@@ -81,8 +81,8 @@ async def test_a_vehicle_is_not_made_a_gimbal() -> None:
     port = free_port(socket.SOCK_DGRAM)
     async with station(port) as (made, _), sender(port) as send:
         codec = Codec(7, 1)
-        await until(lambda: made.attached, lambda: send(codec.pack(make("HEARTBEAT", **BEAT))))
-        (each,) = made._vehicles.values()
+        await until(lambda: made.vehicles.attached, lambda: send(codec.pack(make("HEARTBEAT", **BEAT))))
+        (each,) = made.vehicles._vehicles.values()
         odd = BEAT | {"type": 26, "custom_mode": 9, "base_mode": 128}
         before = made.link_list().links[0].frames_in
         await until(
@@ -104,7 +104,7 @@ async def test_a_real_flight_makes_one_robot(data: Path) -> None:
                 length = frame_length(log, at + 8) or 0
                 entry.link.feed(log[at + 8 : at + 8 + length], ("127.0.0.1", 14550))
                 at += 8 + length
-            assert made.attached == ("drone_1",)
+            assert made.vehicles.attached == ("drone_1",)
 
 
 class Hub:
@@ -116,9 +116,9 @@ class Hub:
         wire: Any = Wire()
         wire.delete = self.deleted.append
         self.hub = RobotHub(
-            RobotsConfig(), session=wire, store=FakeStore(), gateway="gw-1", site=made._site, roster=self.roster
+            RobotsConfig(), session=wire, store=FakeStore(), gateway="gw-1", site=Site(), roster=self.roster
         )
-        self.hub._vehicles = made
+        self.hub._mavlink = made
 
 
 async def test_a_robot_that_is_gone_can_be_forgotten() -> None:
@@ -127,16 +127,16 @@ async def test_a_robot_that_is_gone_can_be_forgotten() -> None:
     async with station(port, heartbeat_lost_s=0.3) as (made, _), sender(port) as send:
         codec, it = Codec(7, 1), Hub(made)
         beat: Callable[[], None] = lambda: send(codec.pack(make("HEARTBEAT", **BEAT)))  # noqa: E731
-        await until(lambda: made.online("drone_7"), beat)
+        await until(lambda: made.vehicles.online("drone_7"), beat)
         with pytest.raises(RefusedError, match="drone_7 is online"):
             await it.hub.forget(RobotForget(robot="drone_7"))
-        await until(lambda: not made.online("drone_7"))
+        await until(lambda: not made.vehicles.online("drone_7"))
         done = await it.hub.forget(RobotForget(robot="drone_7", by="ann"))
-        assert (done.robot, done.gateway, made.attached) == ("drone_7", "gw-1", ())
+        assert (done.robot, done.gateway, made.vehicles.attached) == ("drone_7", "gw-1", ())
         assert it.deleted == ["swiftbot/test/robot/drone_7/state"]
         with pytest.raises(NotFoundError, match="no robot 'drone_7'"):
             await it.hub.forget(RobotForget(robot="drone_7"))
-        await until(lambda: made.online("drone_7"), beat)
+        await until(lambda: made.vehicles.online("drone_7"), beat)
         it.roster["rover_1"] = RobotInfo(id="rover_1", kind="zenoh")
         with pytest.raises(RefusedError, match="rover_1 is online"):
             await it.hub.forget(RobotForget(robot="rover_1"))

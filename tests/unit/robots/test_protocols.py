@@ -218,7 +218,7 @@ async def test_counts_and_numbers_that_cannot_be_end_in_time() -> None:
 
 
 async def test_parameters_are_read_and_written() -> None:
-    """A write is checked by the value that holds; what keeps the vehicle safe is not written; silence is told."""
+    """A write is checked by the value that holds; what keeps the vehicle safe is not written; silence is reported."""
     values = {"WPNAV_SPEED": 500.0, "STUBBORN": 1.0}
 
     def script(sent: Message) -> list[Message]:

@@ -5,10 +5,10 @@ from collections import Counter
 from pathlib import Path
 
 from appliance.model import Site
+from appliance.model.robot_api import Remote
 from appliance.robots.mavlink.dialect import Codec, Frame, frame_length
 from appliance.robots.mavlink.links import UdpServer
 from appliance.robots.mavlink.vehicle import Vehicle
-from appliance.robots.settings import Remote
 
 
 def test_a_real_dive_is_read_whole(data: Path) -> None:
@@ -18,13 +18,17 @@ def test_a_real_dive_is_read_whole(data: Path) -> None:
     vehicle = Vehicle("sub", site=Site(), send=lambda _: None)
     modes: set[bool] = set()
 
-    def heard(frame: Frame, address: tuple[str, int]) -> None:
-        names[frame.name] += 1
-        if frame.system == 1:
-            vehicle.hear(frame, 0.0)
-            modes.add(vehicle.armed)
+    class Ears:
+        busy = False
 
-    link = UdpServer(Remote("udp", "127.0.0.1", 0, True), Codec(245, 191), heard)
+        def receive(self, link: int, frame: Frame, address: tuple[str, int]) -> None:
+            del link, address
+            names[frame.name] += 1
+            if frame.system == 1:
+                vehicle.hear(frame, 0.0)
+                modes.add(vehicle.armed)
+
+    link = UdpServer(Remote("udp", "127.0.0.1", 0, True), Codec(245, 191), Ears())
     at = records = 0
     while at < len(log):
         (stamp,) = struct.unpack_from(">Q", log, at)

@@ -111,7 +111,7 @@ async def test_an_item_out_of_turn_is_asked_for_in_its_turn(store: FakeStore) ->
 
 
 async def test_an_upload_whose_items_do_not_come_has_an_end(store: FakeStore) -> None:
-    """Both ends are told, after so many tries, and a new upload is taken (mavlink/MAVSDK#617)."""
+    """Both ends hear so, after so many tries, and a new upload is taken (mavlink/MAVSDK#617)."""
     ground = Ground(store, tries=3)
     ground.tell("MISSION_COUNT", count=2)
     for _ in range(50):

@@ -183,7 +183,7 @@ def test_a_short_text_ends_where_its_bytes_end() -> None:
 
 
 def test_a_text_of_fifty_characters_has_no_terminator() -> None:
-    """All fifty are told, and not one byte more (ArduPilot/ardupilot#5862)."""
+    """All fifty are sent, and not one byte more (ArduPilot/ardupilot#5862)."""
     assert _told((b"x" * 50, 0, 0)) == ["x" * 50]
 
 
@@ -230,7 +230,7 @@ def test_a_slow_end_gets_the_messages_that_its_link_lets_out() -> None:
 
 
 def test_what_is_sent_again_later_is_no_copy() -> None:
-    """Copies stop only what comes within half a second: lost log data sent anew goes through.
+    """Copies stop only what comes within half a second: lost log data sent again goes through.
 
     Reported as mavlink-router/mavlink-router#323.
     """

@@ -66,6 +66,82 @@ def test_silent_ends_are_forgotten() -> None:
     assert made.destinations(passage(255, to=1, part=1), GCS) == ()
 
 
+def fleet(*, shared: tuple[str, ...] = ()) -> tuple[RoutingTable, list[End]]:
+    """Return a router with a ground station, three vehicles on links of their own, and the first one's camera."""
+    ends = [End(number, ("", number)) for number in range(5)]
+    made = RoutingTable([Rules()] * 5, own_system=OWN, shared=shared)
+    senders = ((255, 190), (1, 1), (2, 1), (3, 1), (1, 100))
+    for end, (system, component) in zip(ends, senders, strict=True):
+        made.hear(passage(system, component), end, 0.0, autopilot=component == 1)
+    return made, ends
+
+
+def test_vehicles_do_not_get_each_others_telemetry() -> None:
+    """A vehicle's word to all goes to the station and to its own camera; vehicles get what is shared."""
+    made, (ground, one, two, three, camera) = fleet(shared=("ADSB_VEHICLE",))
+    assert made.destinations(passage(1, name="ATTITUDE"), one) == (ground, camera)
+    assert made.destinations(passage(2, name="ATTITUDE"), two) == (ground,)
+    assert made.destinations(passage(1, name="ADSB_VEHICLE"), one) == (ground, two, three, camera)
+    assert made.destinations(passage(1, to=2, part=1), one) == (two,)
+    assert made.destinations(passage(255, 190, name="HEARTBEAT"), ground) == (one, two, three, camera)
+    made.hear(passage(1, 191), one, 0.0)
+    assert made.destinations(passage(1, 191, name="STATUSTEXT"), one) == (ground, two, three, camera)
+
+
+def test_an_end_where_more_than_vehicles_is_heard_gets_all() -> None:
+    """A station behind the same radio as a vehicle sees the whole fleet; when it is gone the vehicle does not."""
+    made, (ground, one, two, three, camera) = fleet()
+    made.hear(passage(254, 190), two, 1.0)
+    assert made.destinations(passage(1, name="ATTITUDE"), one) == (ground, two, camera)
+    for end, system in ((ground, 255), (one, 1), (two, 2), (three, 3)):
+        made.hear(passage(system), end, 61.5, autopilot=system != 255)
+    assert made.destinations(passage(1, name="ATTITUDE"), one) == (ground,)
+
+
+def test_a_station_with_two_links_gets_telemetry_on_both() -> None:
+    """The link on which its last frame was late stays a station's; a vehicle's second link stays a vehicle's."""
+    made, (ground, one, _, _, camera) = fleet()
+    second, spare = End(0, ("", 10)), End(2, ("", 20))
+    made.hear(passage(255, 190), second, 1.0)
+    made.hear(passage(2, 1), spare, 1.0, autopilot=True)
+    assert set(made.destinations(passage(1, name="ATTITUDE"), one)) == {ground, second, camera}
+    assert made.destinations(passage(255, to=2, part=1), ground) == (spare,)
+
+
+def test_what_is_no_vehicle_any_more_is_heard_by_all() -> None:
+    """A system of which nobody has been heard for a minute is no vehicle: its next sender may be a station."""
+    made, (_, one, two, _, _) = fleet()
+    made.hear(passage(2), two, 61.5)
+    made.hear(passage(1, 190), one, 62.0)
+    assert made.destinations(passage(1, 190, name="HEARTBEAT"), one) == (two,)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 4), st.sampled_from((1, 100, 191)), st.integers(0, 3), st.booleans()), max_size=12
+    )
+)
+def test_only_vehicles_are_passed_over(heard: list[tuple[int, int, int, bool]]) -> None:
+    """Of all other ends exactly those are left out where nobody but other vehicles was heard."""
+    made = RoutingTable([Rules()] * 4, own_system=OWN)
+    where: dict[tuple[int, int], int] = {}
+    vehicles: set[int] = set()
+    for system, component, link, autopilot in heard:
+        made.hear(passage(system, component), End(link, ("", 0)), 0.0, autopilot=autopilot)
+        where[system, component] = link
+        vehicles |= {system} if autopilot else set()
+    for (system, component), link in where.items():
+        at = {number: {each for each, _, link, _ in heard if link == number} for number in range(4)}
+        telemetry = system in vehicles and component != 191
+        expected = {
+            number
+            for number in {link for _, _, link, _ in heard} - {link}
+            if not (telemetry and at[number] <= vehicles - {system})
+        }
+        found = made.destinations(passage(system, component, name="ATTITUDE"), End(link, ("", 0)))
+        assert {end.link for end in found} == expected
+
+
 @given(st.lists(st.tuples(st.binary(min_size=1, max_size=2), st.floats(0, 3)), max_size=40))
 def test_repetitions_within_the_time_and_no_others(frames: list[tuple[bytes, float]]) -> None:
     """The same bytes are dropped exactly when they were last let through less than half a second before."""

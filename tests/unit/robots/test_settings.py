@@ -3,7 +3,8 @@
 import pytest
 
 from appliance.errors import ConfigError
-from appliance.robots.settings import MavlinkLink, RobotsConfig, read_remote
+from appliance.model.robot_api import MavlinkLink, read_remote
+from appliance.robots.settings import RobotsConfig
 
 
 @pytest.mark.parametrize("url", ["", "127.0.0.1:14550", "http://a:1", "udp://a", "udp://a:99999", "udp://a:1/x"])

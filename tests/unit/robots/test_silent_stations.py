@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
+from appliance.model.robot_api import MavlinkLink
 from appliance.ports import free_port
 from appliance.robots.mavlink.dialect import Codec, Frame, make
-from appliance.robots.settings import MavlinkLink, Template
+from appliance.robots.settings import Template
 from tests.unit.robots.links import BEAT, LINKS, Outside, beside, sender, station, until
 
 pytestmark = pytest.mark.anyio
@@ -43,13 +44,13 @@ async def test_a_station_without_a_heartbeat_is_routed_and_answered() -> None:
         ear(two) as (ground, at_ground),
     ):
         codec, asker = Codec(1, 1), Codec(255, 190)
-        await until(lambda: made.attached, lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: made.vehicles.attached, lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))))
         ask = {"target_system": 1, "target_component": 1}
         await until(
             lambda: any(each.name == "PARAM_REQUEST_READ" for each in at_vehicle),
             lambda: ground(asker.pack(make("PARAM_REQUEST_READ", param_id=b"X", param_index=-1, **ask))),
         )
-        assert (255, 190) in made._switch.router.routes
+        assert (255, 190) in made.routing.routes
         await until(
             lambda: any(each.name == "HEARTBEAT" and each.system == 1 for each in at_ground),
             lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))),
@@ -63,7 +64,7 @@ async def test_a_station_without_a_heartbeat_is_routed_and_answered() -> None:
             lambda: ground(asker.pack(make("TIMESYNC", tc1=0, ts1=77))),
         )
         assert "unknown_system" not in refused
-        assert made.attached == ("drone_1",)
+        assert made.vehicles.attached == ("drone_1",)
 
 
 @pytest.mark.parametrize("kind", LINKS)
@@ -76,7 +77,7 @@ async def test_on_any_link_its_frames_arrive(kind: str) -> None:
         await outside.meet(made, closing)
         vehicle, heard = await closing.enter_async_context(ear(port))
         codec, asker = Codec(1, 1), Codec(255, 190)
-        await until(lambda: made.attached, lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: made.vehicles.attached, lambda: vehicle(codec.pack(make("HEARTBEAT", **BEAT))))
         ask = make("PARAM_REQUEST_LIST", target_system=1, target_component=1)
         await until(
             lambda: any(each.name == "PARAM_REQUEST_LIST" for each in heard), lambda: outside.write(asker.pack(ask))
@@ -88,18 +89,18 @@ async def test_who_takes_a_vehicles_address_is_not_learned() -> None:
     async with beside("udp listen") as (made, refused, outside, vehicle):
         one, two = Codec(1, 1), Codec(1, 1)
         two._mav.seq = 100
-        await until(lambda: made.attached, lambda: vehicle(one.pack(make("HEARTBEAT", **BEAT))))
-        before = made._switch.router.where(1, 1)
+        await until(lambda: made.vehicles.attached, lambda: vehicle(one.pack(make("HEARTBEAT", **BEAT))))
+        before = made.routing.where(1, 1)
         time = {"time_unix_usec": 1, "time_boot_ms": 1}
         await until(
             lambda: refused.get("unknown_system", 0) > 3, lambda: outside.write(two.pack(make("SYSTEM_TIME", **time)))
         )
-        assert made._switch.router.where(1, 1) == before
+        assert made.routing.where(1, 1) == before
         # One whose name is taken, or that may have none, is not learned of by its other frames either.
         await until(
             lambda: refused.get("name_conflict", 0) > 3, lambda: outside.write(two.pack(make("HEARTBEAT", **BEAT)))
         )
-        assert made._switch.router.where(1, 1) == before
+        assert made.routing.where(1, 1) == before
 
 
 async def test_vehicles_that_may_not_be_robots_are_not_routed() -> None:
@@ -107,9 +108,9 @@ async def test_vehicles_that_may_not_be_robots_are_not_routed() -> None:
     port = free_port(socket.SOCK_DGRAM)
     async with station(port, max_vehicles=1) as (made, refused), sender(port) as send:
         one, two = Codec(1, 1), Codec(2, 1)
-        await until(lambda: made.attached, lambda: send(one.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: made.vehicles.attached, lambda: send(one.pack(make("HEARTBEAT", **BEAT))))
         await until(lambda: refused.get("unknown_system", 0) > 3, lambda: send(two.pack(make("HEARTBEAT", **BEAT))))
         time = {"time_unix_usec": 1, "time_boot_ms": 1}
         before = refused["unknown_system"]
         await until(lambda: refused["unknown_system"] > before + 3, lambda: send(two.pack(make("SYSTEM_TIME", **time))))
-        assert (2, 1) not in made._switch.router.routes
+        assert (2, 1) not in made.routing.routes

@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 
+from appliance.model.robot_api import MavlinkLink
 from appliance.ports import free_port
 from appliance.robots.mavlink import statustext
 from appliance.robots.mavlink.dialect import Codec, Frame, make
 from appliance.robots.mavlink.statustext import Said, Texts
-from appliance.robots.settings import MavlinkLink
 from tests.unit.robots.links import BEAT, station, until
 from tests.unit.robots.test_silent_stations import ear
 
@@ -92,8 +92,8 @@ async def test_what_is_said_of_a_vehicle_comes_from_its_system(companion: bool) 
             ground(asker.pack(make("HEARTBEAT", **(BEAT | {"type": 6, "autopilot": 8}))))
 
         ready = {(7, 1), (255, 190), *([(7, 191)] if companion else [])}
-        await until(lambda: made.attached and ready <= made._switch.router.routes.keys(), act)
-        (each,) = made._vehicles.values()
+        await until(lambda: made.vehicles.attached and ready <= made.routing.routes.keys(), act)
+        (each,) = made.vehicles._vehicles.values()
         for part in statustext.parts(b"y" * 60, statustext.NOTICE):
             each.vehicle.announce(part)
         for frames in (at_vehicle, at_ground):

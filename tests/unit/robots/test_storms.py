@@ -67,7 +67,7 @@ def test_a_simulated_vehicle_answers_for_itself_alone(message: str, fields: dict
 
 def _run(damper: Damper, hz: float, seconds: float, start: float = 0.0, kind: tuple[int, int, str] = KIND) -> int:
     """Return how many frames pass."""
-    return sum(damper.passes(kind, start + number / hz) for number in range(round(hz * seconds)))
+    return sum(damper.passes(*kind, start + number / hz) for number in range(round(hz * seconds)))
 
 
 def test_what_is_usual_passes() -> None:
@@ -110,7 +110,7 @@ def test_ever_other_senders_cost_no_memory() -> None:
     damper = Damper(1.0)
     for number in range(2 * MAX_KINDS):
         for _ in range(6):
-            damper.passes((number % 255 + 1, number // 255, "PARAM_VALUE"), 0.0)
+            damper.passes(number % 255 + 1, number // 255, "PARAM_VALUE", 0.0)
     assert len(damper._flows) == MAX_KINDS == len(damper.damped)
     assert _run(Damper(0.0), 1e5, 1.0) == 1e5
 
@@ -118,7 +118,8 @@ def test_ever_other_senders_cost_no_memory() -> None:
 async def test_a_storm_over_the_routing_dies_down() -> None:
     """Two ends answer each other's answers through the gateway: what passes becomes a trickle, and people hear once."""
     one = free_port(socket.SOCK_DGRAM)
-    async with station(one, message_hz=100.0) as (made, refused), sender(one) as vehicle:
+    share = ("PARAM_VALUE",)  # as of two programs that are no vehicles: those do not hear each other
+    async with station(one, message_hz=100.0, vehicles_share=share) as (made, refused), sender(one) as vehicle:
         (entry,) = tuple(made.links)
         out: list[bytes] = []
         cast("Any", entry.link)._write = lambda raw, _: out.append(raw) or True
@@ -148,4 +149,4 @@ async def test_a_storm_over_the_routing_dies_down() -> None:
         assert "a storm of PARAM_VALUE from" in notices[0].text
         # The vehicle elsewhere is served all the same.
         other = Codec(7, 1)
-        await until(lambda: "drone_7" in made.attached, lambda: vehicle(other.pack(make("HEARTBEAT", **BEAT))))
+        await until(lambda: "drone_7" in made.vehicles.attached, lambda: vehicle(other.pack(make("HEARTBEAT", **BEAT))))

@@ -245,7 +245,7 @@ def test_parts_that_are_cut_anywhere_cost_nothing() -> None:
 
 
 def test_a_count_that_no_message_has_is_refused_and_kept_nowhere() -> None:
-    """Sixty-five thousand parts announced, again and again: the sender is told, and memory stays."""
+    """Sixty-five thousand parts announced, again and again: the sender hears so, and memory stays."""
     end = Channel(itertools.count().__next__)
     for number in range(1000):
         head = struct.pack("<2sBBIHHI", b"SB", 1, PART, number, number % 65_535, 65_535, 0)
@@ -257,7 +257,7 @@ def test_a_count_that_no_message_has_is_refused_and_kept_nowhere() -> None:
 
 
 def test_a_changed_message_is_not_taken() -> None:
-    """Parts that do not make the announced checksum are refused, and the sender is told."""
+    """Parts that do not make the announced checksum are refused, and the sender hears so."""
     radio = Radio(loss=0.0, seed=4)
     number = radio.ends[0].send(bytes(150), 0.0)
     first, second = radio.ends[0].due(0.0)

@@ -137,7 +137,7 @@ async def test_a_thousand_tasks_over_a_bad_link() -> None:
 
 
 async def test_news_until_the_end() -> None:
-    """Each change of a task is told once, also to one that asks to follow it, and nothing after its end."""
+    """Each change of a task is sent once, also to one that asks to follow it, and nothing after its end."""
     air = Air()
     assert (await air.ask(letter("submit", "t1", "go home"))).op == "accepted"
     assert (await air.ask(letter("follow", "t1"))).state == "running"
@@ -151,7 +151,7 @@ async def test_news_until_the_end() -> None:
 
 
 async def test_the_end_is_told_after_an_outage_with_many_changes() -> None:
-    """What changed while a robot was not heard is told as it stands now: steps on the way do not crowd out the end."""
+    """What changed while a robot was not heard is sent as it stands now: steps on the way do not crowd out the end."""
     air = Air()
     assert (await air.ask(letter("submit", "t1", "go home"))).op == "accepted"
     air.loss = 1.0
@@ -209,7 +209,7 @@ async def test_news_of_nobody_are_not_kept() -> None:
 
 
 async def test_results_beyond_a_message_are_left_out() -> None:
-    """However long the names of subtasks and what is told of a failure: the end of a task fits into a message."""
+    """However long the names of subtasks and what is said of a failure: the end of a task fits into a message."""
     air = Air()
     assert (await air.ask(letter("submit", "t1", "go home"))).op == "accepted"
     subtasks = tuple(
@@ -362,6 +362,6 @@ async def test_payloads_that_are_none() -> None:
         air.codec = Codec(system, 1)
         air.desk.take(air.frame(b""), reply=air.reply)
     assert len(air.desk._senders) == 64
-    # Who was forgotten for them is told nothing more, and that is not kept either.
+    # One forgotten for them hears nothing more, and that is not kept either.
     air.desk.news(TaskRecord(id="t1", instruction="", state=TaskState.RUNNING, sequence=3))
     assert not air.desk.follows("t1")

@@ -20,7 +20,7 @@ def beat(status: int) -> Message:
 
 
 def test_what_an_estimator_does_not_know() -> None:
-    """Missing bits are told in words; a relative position stands in unless it is held constant; glitches are told."""
+    """Missing bits are named in words; a relative position stands in unless held constant; glitches are reported."""
     assert estimator(WELL) == ()
     assert estimator(WELL & ~0x10) == ()
     assert estimator(WELL & ~0x10 & ~0x08) == ("no position",)
@@ -30,7 +30,7 @@ def test_what_an_estimator_does_not_know() -> None:
 
 
 def test_failsafes_add_up_and_end() -> None:
-    """Heartbeat, battery and fence each tell; low is a warning, critical a failsafe; news is told once."""
+    """Heartbeat, battery and fence each tell; low is a warning, critical a failsafe; news is published once."""
     condition = Condition()
     assert condition.hear("HEARTBEAT", beat(5))
     assert not condition.hear("HEARTBEAT", beat(5))

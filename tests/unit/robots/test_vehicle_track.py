@@ -22,7 +22,7 @@ def test_a_clock_that_stands_is_replaced_by_ours() -> None:
 
 
 def test_a_clock_that_overflows_goes_on_and_one_that_went_back_tells_nothing() -> None:
-    """After 49.7 days it begins anew; a restarted vehicle, or a report overtaken, is far from what was before."""
+    """After 49.7 days it begins again; a restarted vehicle, or a report overtaken, is far from what was before."""
     assert apart_s(_report(2**32 - 100), _report(100)) == 0.2
     assert apart_s(_report(60_000), _report(1_000)) > 1e6
 

@@ -53,7 +53,7 @@ def test_guide_speaks_leads_and_speaks(make_ctx: Make, handler: Load) -> None:
 
 
 def test_dock_drives_to_the_charger_or_the_station_named(make_ctx: Make, handler: Load) -> None:
-    """Without a station it is the charger; a robot that flies is told what to do instead, and stays."""
+    """Without a station it is the charger; a robot that flies hears what to do instead, and stays."""
     ctx = make_ctx()
     ctx.info["battery_percent"] = 71.0
     result = handler("dock").run(ctx)

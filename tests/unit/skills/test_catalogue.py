@@ -16,9 +16,13 @@ WITH_HANDLER = {
     "goto", "photograph", "detect", "pick", "place", "record_video", "report", "notify", "takeoff", "land",
     "open", "close", "switch_on", "switch_off", "give", "say", "guide", "dock",
     "extract_frames", "hold", "return_home", "count", "find", "follow_path", "patrol", "plan_route", "orbit", "track",
-    "ask", "wait_for",
+    "ask", "wait_for", "train_local", "aggregate", "evaluate",
+    "encode_clip", "classify_action", "preprocess_audio", "transcribe", "correct_text",
 }  # fmt: skip
 MODULES_OF = {"base": set[str](), "vision": {"numpy", "PIL"}}
+MODULES_OF["learn"] = MODULES_OF["vision"] | {"torch", "av", "soundfile", "pocketsphinx"}
+WITHOUT_COMMANDS = {"train_local"}
+"""Run on a robot, as they work on its data, and send it no command."""
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +61,8 @@ def test_loading_again_is_free() -> None:
 def test_every_robot_skill_that_is_implemented_names_its_verbs() -> None:
     """A skill with handler that runs on a robot says which commands it sends, so that placement can choose."""
     for each in load_catalogue().skills.values():
-        assert bool(each.verbs) == (each.implemented and each.runs == "robot"), each.id
+        commanding = each.implemented and each.runs == "robot" and each.id not in WITHOUT_COMMANDS
+        assert bool(each.verbs) == commanding, each.id
 
 
 def _imports(file: Path) -> set[str]:
@@ -70,18 +75,21 @@ def _imports(file: Path) -> set[str]:
     return found
 
 
-def _shared_modules(file: Path) -> set[str]:
-    """Modules of `_lib` that a file needs, over all steps."""
-    found: set[str] = set()
+def _shared_modules(file: Path) -> set[Path]:
+    """Files of `_lib` that a file needs, over all steps."""
+    found: set[Path] = set()
     waiting = [file]
     while waiting:
-        for node in ast.walk(ast.parse(waiting.pop().read_text())):
+        at = waiting.pop()
+        for node in ast.walk(ast.parse(at.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.level == 1 or (node.module or "").split(".")[0] == "_lib"):
-                tail = (node.module or "").removeprefix("_lib").lstrip(".")
-                for name in [tail] if tail else [alias.name for alias in node.names]:
-                    if name not in found:
-                        found.add(name)
-                        waiting.append(SKILLS / "_lib" / f"{name}.py")
+                inside = (node.module or "").split(".")
+                folder = at.parent if node.level else SKILLS
+                base = folder.joinpath(*(part for part in inside if part))
+                for each in [base.with_suffix(".py"), *(base / f"{alias.name}.py" for alias in node.names)]:
+                    if each.is_file() and each not in found:
+                        found.add(each)
+                        waiting.append(each)
     return found
 
 
@@ -90,7 +98,7 @@ def test_a_handler_imports_only_what_its_image_has(skill: str) -> None:
     """A handler and the shared modules it needs import the standard library and its image's packages only."""
     allowed = set(sys.stdlib_module_names) | {"_lib"} | MODULES_OF[load_catalogue().skills[skill].image]
     file = SKILLS / skill / "handler.py"
-    for each in [file, *(SKILLS / "_lib" / f"{name}.py" for name in _shared_modules(file))]:
+    for each in [file, *_shared_modules(file)]:
         assert _imports(each) <= allowed, each
 
 

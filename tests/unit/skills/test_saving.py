@@ -69,7 +69,7 @@ def test_find_goes_on_with_the_next_view(
 
 
 def test_what_find_tells_so_far_counts_the_views_before_a_move(make_ctx: Make, handler: Load, leave: Leave) -> None:
-    """Each view that showed nothing is told at once; the next attempt tells those of the one before among its own."""
+    """A view that showed nothing is reported at once; the next attempt counts those of the one before as its own."""
     first, second, whole = (make_ctx(target="red box") for _ in range(3))
     for each in (first, whole):
         each.info["pose"] = {"x": 16.0, "y": 12.0}

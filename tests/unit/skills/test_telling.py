@@ -58,7 +58,7 @@ def test_a_report_tells_everything_found(make_ctx: Make, handler: Load) -> None:
 
 
 def test_a_report_tells_whom_it_is_for(make_ctx: Make, handler: Load) -> None:
-    """With `to` the person gets the title and the summary; without, nobody is told."""
+    """With `to` the person gets the title and the summary; without, nobody gets a notice."""
     ctx = make_ctx(to="farmer")
     with_inputs(ctx)
     handler("report").run(ctx)

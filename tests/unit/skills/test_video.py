@@ -94,7 +94,11 @@ def test_an_absurd_duration_is_refused(make_ctx: Make, handler: Load, seconds: A
 def test_no_frames_is_a_failure(make_ctx: Make, handler: Load) -> None:
     """A camera that records nothing is a failure that another attempt may cure."""
     ctx = make_ctx(target="aisle")
-    ctx.answers["record"] = lambda _: {}
+
+    def nothing(_: object) -> dict[str, Any]:
+        return {}
+
+    ctx.answers["record"] = nothing
     with pytest.raises(ctx.Fail, match="no frame") as caught:
         handler("record_video").run(ctx)
     assert caught.value.retryable
@@ -130,6 +134,22 @@ def test_frames_are_sampled_from_the_video(make_ctx: Make, handler: Load, ffmpeg
     assert (result["count"], result["source"]) == (3, "aisle.mp4")
     assert "fps=15" in calls()[0]
     assert "note" not in result
+
+
+def test_a_video_is_opened_as_a_file_of_a_known_format_only(
+    make_ctx: Make, handler: Load, ffmpeg: Callable[..., Any]
+) -> None:
+    """A playlist handed on as a video would have ffmpeg open what it names: neither format nor protocol is let in."""
+    calls = ffmpeg(frames=1)
+    ctx = make_ctx()
+    with_video(ctx)
+    handler("extract_frames").run(ctx)
+    (call,) = calls()
+    before = call[: call.index("-i")]
+    assert before[before.index("-protocol_whitelist") + 1] == "file"
+    formats = before[before.index("-format_whitelist") + 1].split(",")
+    assert {"mov", "avi", "wav", "flac"} <= set(formats)
+    assert not {"hls", "dash", "concat", "sdp", "image2", "lavfi", "rtsp"} & set(formats)
 
 
 def test_the_number_of_frames_is_bounded(make_ctx: Make, handler: Load, ffmpeg: Callable[..., Any]) -> None:

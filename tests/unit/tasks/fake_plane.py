@@ -9,11 +9,13 @@ from typing import Any
 import msgspec
 
 from appliance.errors import ConflictError, SwiftbotError, UnreachableError
-from appliance.model import Plan, TaskRecord, VersionVector
+from appliance.model import Plan, TaskRecord, VersionVector, encode
+from appliance.model.keys import Keys, Topic, Verb
 from appliance.plane.dht import LeaveOut, Record
-from appliance.plane.keys import Keys
+from appliance.plane.events import FleetEvents
 from appliance.plane.records import increment
 from appliance.plane.session import Message
+from appliance.plane.settings import PlaneConfig
 from tests.unit.tasks.sample_records import accepted, plan_of
 
 
@@ -25,7 +27,7 @@ class FakeCloser:
 
 
 class FakeSession:
-    """Delivers what is put to whoever subscribed, at once; keeps everything."""
+    """Delivers what is put to all subscribers, at once; keeps everything."""
 
     def __init__(self) -> None:
         self.keys = Keys("f")
@@ -42,6 +44,10 @@ class FakeSession:
             if _matches(expr, key):
                 callback(Message(key, payload, deleted=False, at_ns=0, encoding=""))
 
+    def publish(self, topic: Topic[Any], value: Any, *names: str, express: bool = False) -> None:
+        """Put a fact."""
+        self.put(self.keys(topic, *names), encode(value), express=express)
+
     def subscribe(self, expr: str, callback: Callable[[Message], None]) -> FakeCloser:
         """Deliver raw messages."""
         self.subscribers.append((expr, callback))
@@ -49,26 +55,26 @@ class FakeSession:
 
     def subscribe_typed(
         self,
-        expr: str,
-        kind: type[Any],
+        topic: Topic[Any],
         callback: Callable[[str, Any], None],
-        *,
+        *names: str,
         heed: Callable[[str], bool] = lambda _: True,
     ) -> FakeCloser:
         """Deliver decoded messages."""
 
         def take(message: Message) -> None:
             if heed(message.key):
-                callback(message.key, msgspec.json.decode(message.payload, type=kind))
+                callback(message.key, msgspec.json.decode(message.payload, type=topic.payload))
 
-        return self.subscribe(expr, take)
+        return self.subscribe(self.keys(topic, *names), take)
 
     def refuse(self, what: str, **_: object) -> None:
         """Count."""
         self.refused[what] = self.refused.get(what, 0) + 1
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
-        """Answer with the next prepared reply; the last one again and again."""
+    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool) -> bytes:
+        """Answer with the next prepared reply; the last one again and again. Robots are asked with a signature only."""
+        assert sign
         self.queries.append(payload)
         await asyncio.sleep(0)
         reply = self.replies.pop(0) if len(self.replies) > 1 else self.replies[0]
@@ -94,8 +100,6 @@ class FakeDht:
         self.gateway = gateway
         self.mine = True
         self.break_next: list[Exception] = []
-        self.on_ring_change: list[Callable[[], None]] = []
-        self.resolver: object = None
         self.writes = 0
         self.watchers: list[tuple[Callable[[str], bool], Callable[[Record], None]]] = []
 
@@ -161,17 +165,17 @@ class FakeRpc:
         self.calls: list[tuple[str, str, Any]] = []
         self.registered: dict[str, Callable[[Any], Awaitable[Any]]] = {}
 
-    def register(self, verb: str, request: type[Any], handler: Callable[[Any], Awaitable[Any]]) -> None:
+    def register(self, verb: Verb[Any, Any], handler: Callable[[Any], Awaitable[Any]]) -> None:
         """Keep a handler."""
-        self.registered[verb] = handler
+        self.registered[verb.name] = handler
 
-    async def call(self, gateway: str, verb: str, request: Any, reply: type[Any], *, timeout_s: float = 5.0) -> Any:
+    async def call(self, gateway: str, verb: Verb[Any, Any], request: Any, *, timeout_s: float | None = None) -> Any:
         """Ask the test."""
-        self.calls.append((gateway, verb, request))
+        self.calls.append((gateway, verb.name, request))
         await asyncio.sleep(0)
-        if verb not in self.on:
-            raise UnreachableError(f"nobody answers {verb} on {gateway}")
-        return await self.on[verb](gateway, request)
+        if verb.name not in self.on:
+            raise UnreachableError(f"nobody answers {verb.name} on {gateway}")
+        return await self.on[verb.name](gateway, request)
 
 
 class FakeStore:
@@ -203,9 +207,9 @@ class FakeRegistry:
         self.gateways: dict[str, Any] = {}
         self.containers: dict[str, Any] = {}
         self.robots: dict[str, Any] = {}
-        self.on_change: list[Callable[[str], None]] = []
         self.ages: dict[str, float] = {}
         self.lost_ns: dict[str, int] = {}
+        self.clock_s: dict[str, float] = {}
 
     def age_s(self, gateway: str) -> float:
         """Return what the test says; by default nothing was ever heard."""
@@ -253,6 +257,7 @@ class FakePlane:
 
     def __init__(self, gateway: str = "gw-1") -> None:
         self.gateway = gateway
+        self.config = PlaneConfig()
         self.session = FakeSession()
         self.keys = self.session.keys
         self.dht = FakeDht(gateway)
@@ -261,7 +266,7 @@ class FakePlane:
         self.registry = FakeRegistry()
         self.ring = FakeRing(gateway)
         self.present = {"gw-1", "gw-2", "gw-3"}
-        self.on_member_lost: list[Callable[[str], None]] = []
+        self.events = FleetEvents()
 
     async def owner_of(self, key: str) -> str:
         """Return the one owner."""

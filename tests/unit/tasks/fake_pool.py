@@ -33,14 +33,18 @@ class FakePool:
         *,
         allow_remote: bool,
         inputs: Mapping[str, int],
-        avoid: Mapping[str, str],
+        avoid: Mapping[str, str] | None = None,
         turn: Turn | None = None,
     ) -> Decision:
         """Return the prepared decision."""
-        self.asked.append((allow_remote, dict(inputs), dict(avoid)))
+        self.asked.append((allow_remote, dict(inputs), dict(avoid or {})))
         if self.gate is not None:
             await self.gate.wait()
         return self.decisions.pop(0) if self.decisions else self.decision
+
+    def keep(self, decision: Decision, lease_s: float) -> bool:
+        """Hold it."""
+        return True
 
     def waiting(self) -> list[tuple[Turn, Need]]:
         """Return those whom the test has wait."""

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.anyio
 @settings(deadline=None)
 @given(st.lists(st.floats(0.01, 10), min_size=1, max_size=80), st.integers(1, 50))
 def test_when_to_come_back_follows_the_measured_rate(gaps: list[float], ends: int) -> None:
-    """Nothing is told before two have ended; then as many ends as are wanted at the rate of late, within bounds."""
+    """No estimate before two have ended; then as many ends as are wanted, at the rate of late, within bounds."""
     measured, now = Ends(), 100.0
     assert measured.retry_after_s(1, now) == 0.0
     measured.ended(now)
@@ -101,7 +101,7 @@ async def test_a_task_whose_deadline_passes_ends_with_that_reason(bench: Any) ->
 
 async def test_a_deadline_counts_over_a_takeover_and_while_planning(bench: Any) -> None:
     """What had passed before counts; a planner that takes too long is not waited for."""
-    bench.around.planning = asyncio.Event()
+    bench.context.planning = asyncio.Event()
     await bench.start(replace(bench.plane.accepted(), deadline_s=60.0), elapsed_s=59.9)
     ended = await bench.end()
     assert ended.failure.code == "deadline"
@@ -111,7 +111,7 @@ async def test_a_deadline_counts_over_a_takeover_and_while_planning(bench: Any) 
 
 async def test_a_group_is_in_the_record_before_anything_is_sent(bench: Any) -> None:
     """The transition comes before the dispatch; the order names the gateways that the submitter allows."""
-    bench.around.groups = [Group(members=("gw-1", "gw-2"), root="gw-1", why="formed")]
+    bench.context.groups = [Group(members=("gw-1", "gw-2"), root="gw-1", why="formed")]
     await bench.start(replace(bench.plane.accepted(), within=("gw-1", "gw-2", "gw-3")))
     _, request = await bench.ordered()
     assert request.group == ("gw-1", "gw-2", "gw-3")
@@ -124,13 +124,13 @@ async def test_a_group_is_in_the_record_before_anything_is_sent(bench: Any) -> N
 
 async def test_without_room_a_subtask_waits_with_a_note_and_uses_up_no_attempt(bench: Any) -> None:
     """It is sent when there is room, as its first attempt; what it waits for stands in the record meanwhile."""
-    bench.around.room = False
-    bench.around.expected = "3 subtasks wait for room before it"
+    bench.context.room = False
+    bench.context.expected = "3 subtasks wait for room before it"
     await bench.start()
     waiting = await bench.until(
         lambda record: "waits for room" in record.subtasks[0].note if record.subtasks else False
     )
     assert waiting.subtasks[0].attempt == 0
     assert waiting.note == "3 subtasks wait for room before it"
-    bench.around.room = True
+    bench.context.room = True
     assert (await bench.ordered())[1].attempt == 1

@@ -24,18 +24,19 @@ from appliance.model import (
     TaskRecord,
     TaskState,
     VolumeInfo,
+    keyspace,
 )
-from appliance.plane.keys import Keys
-from appliance.pool.decisions import EvictionCase, selection_case, watched
+from appliance.model.keys import Keys
+from appliance.model.transitions import fingerprint
+from appliance.pool.decisions import EvictionCase, selection_case
 from appliance.pool.policies import Idle
-from appliance.pool.selection import Candidate, Facts, select
+from appliance.pool.selection import Candidate, Facts, Link, select
 from appliance.pool.settings import PoolConfig
 from appliance.tasks import machine
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.placement import Asked, place, placement_case
 from appliance.tasks.replay import check
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.transition import fingerprint
 
 KEYS = Keys("f")
 PLAN = Plan(domain="navigation", subtasks=(Subtask(id="s1", skill="goto"),))
@@ -59,7 +60,7 @@ def history(*steps: tuple[TransitionKind, dict[str, Any]]) -> list[tuple[str, St
             **({"task": "t-1", "sequence": number, "kind": kind, "at_ns": number, "coordinator": "gw-1"} | fields)
         )
         record = machine.apply(record, event)
-        told += [(KEYS.transition("t-1"), event), (KEYS.task("t-1"), record)]
+        told += [(KEYS(keyspace.TRANSITION, "t-1"), event), (KEYS(keyspace.TASK_UPDATE, "t-1"), record)]
     return told
 
 
@@ -124,7 +125,7 @@ def test_what_a_killed_gateway_took_with_it_is_no_difference(tmp_path: Path) -> 
 
 
 def test_a_new_coordinator_goes_on_from_what_was_written(tmp_path: Path) -> None:
-    """Progress that was told and not written is forgotten by whoever takes over; that is as it should be."""
+    """Progress that was told and not written is forgotten by the next coordinator; that is as it should be."""
     steps = [
         *STEPS[:3],
         (TransitionKind.STARTED, {"subtask": "s1", "attempt": 1, "gateway": "gw-1"}),
@@ -134,7 +135,7 @@ def test_a_new_coordinator_goes_on_from_what_was_written(tmp_path: Path) -> None
     unwritten = Transition(
         task="t-1", sequence=5, kind=TransitionKind.PROGRESS, at_ns=5, coordinator="gw-1", subtask="s1", attempt=1
     )
-    report = check([write(tmp_path / "a.mcap", [*told[:8], (KEYS.transition("t-1"), unwritten), *told[8:]])])
+    report = check([write(tmp_path / "a.mcap", [*told[:8], (KEYS(keyspace.TRANSITION, "t-1"), unwritten), *told[8:]])])
     assert report.same, report.divergences
     assert report.checked["machine"] == 6
 
@@ -227,13 +228,10 @@ def _selected() -> Struct:
     config, need = PoolConfig(), Need(image="base", volumes=("map",))
     here = ContainerInfo(id="c1", gateway="gw-1", image="base", state=ContainerState.READY)
     there = replace(here, id="c2", gateway="gw-2", volumes=("map",))
-    facts = watched(
-        Facts(
-            inputs={"gw-2": 5_000},
-            volumes={"map": (VolumeInfo(name="map", gateway="gw-2", size_bytes=40_000_000),)},
-            files_ms=lambda size, _: size / 1e4,
-            state_ms=lambda size, _: size / 1e4,
-        )
+    facts = Facts(
+        inputs={"gw-2": 5_000},
+        volumes={"map": (VolumeInfo(name="map", gateway="gw-2", size_bytes=40_000_000),)},
+        links={"gw-2": Link(bytes_per_s=1e7)},
     )
     offers = [Candidate(container=there, round_trip_ms=2.0)]
     decision = select(need, [here], offers, 2_000.0, config, gateway="gw-1", facts=facts)
@@ -250,9 +248,9 @@ def _evicted() -> EvictionCase:
 def test_placement_selection_and_eviction_are_made_again(tmp_path: Path) -> None:
     """What they rested on is in the message; made again by the same code they come out the same."""
     told = [
-        (KEYS.decided("gw-1", "placement"), _placed(TasksConfig())),
-        (KEYS.decided("gw-1", "selection"), _selected()),
-        (KEYS.decided("gw-1", "eviction"), _evicted()),
+        (KEYS(keyspace.DECIDED, "gw-1", "placement"), _placed(TasksConfig())),
+        (KEYS(keyspace.DECIDED, "gw-1", "selection"), _selected()),
+        (KEYS(keyspace.DECIDED, "gw-1", "eviction"), _evicted()),
     ]
     report = check([write(tmp_path / "a.mcap", told)])
     assert report.same, report.divergences
@@ -269,7 +267,7 @@ def test_placement_selection_and_eviction_are_made_again(tmp_path: Path) -> None
 )
 def test_other_decisions_are_differences(tmp_path: Path, what: str, case: Struct, logged: str) -> None:
     """A decision that the code does not make is shown with what it makes instead."""
-    report = check([write(tmp_path / "a.mcap", [(KEYS.decided("gw-1", what), case)])])
+    report = check([write(tmp_path / "a.mcap", [(KEYS(keyspace.DECIDED, "gw-1", what), case)])])
     assert report.diverged == 1
     assert report.divergences[0].decider == what
     assert logged in report.divergences[0].logged
@@ -278,7 +276,7 @@ def test_other_decisions_are_differences(tmp_path: Path, what: str, case: Struct
 
 def test_malformed_decisions_are_counted(tmp_path: Path) -> None:
     """A stranger's put on a key of decisions is no difference and no crash; a log without any decision is an error."""
-    told = [(KEYS.decided("gw-1", "placement"), PLAN), (KEYS.transition("t-1"), PLAN)]
+    told = [(KEYS(keyspace.DECIDED, "gw-1", "placement"), PLAN), (KEYS(keyspace.TRANSITION, "t-1"), PLAN)]
     report = check([write(tmp_path / "a.mcap", told)])
     assert report.unchecked == {"malformed": 2}
     with pytest.raises(RecordError, match="no decision"):

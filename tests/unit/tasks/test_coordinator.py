@@ -9,8 +9,9 @@ from msgspec.structs import replace
 
 from appliance.errors import DeadlineError, PlanError, RefusedError, UnreachableError
 from appliance.model import Failure, RunEvent, RunEventKind, Subtask, SubtaskState, TaskState, encode
-from appliance.tasks.api import RunAsk, RunStatus
-from appliance.tasks.context import CancelAsked, GatewayLost, Wake, task_key
+from appliance.model.task_api import RunAsk, RunStatus
+from appliance.tasks.events import CancelAsked, GatewayLost, GatewayRelinked, Wake
+from appliance.tasks.records import task_key
 
 pytestmark = pytest.mark.anyio
 
@@ -45,7 +46,7 @@ async def test_a_task_is_planned_run_and_ends(bench: Any) -> None:
 
 async def test_a_refused_order_is_tried_on_another_gateway(bench: Any) -> None:
     """A draining gateway's refusal costs an attempt number, not a retry of the skill."""
-    bench.around.refusals = [RefusedError("gw-1 is draining")]
+    bench.context.refusals = [RefusedError("gw-1 is draining")]
     await bench.start()
     assert (await bench.ordered())[0] == "gw-1"
     gateway, request = await bench.ordered()
@@ -56,7 +57,7 @@ async def test_a_refused_order_is_tried_on_another_gateway(bench: Any) -> None:
 
 async def test_an_order_without_an_answer_is_repeated_as_a_new_attempt(bench: Any) -> None:
     """A run that may or may not have begun is outdated by the next attempt."""
-    bench.around.refusals = [DeadlineError("no answer in time")]
+    bench.context.refusals = [DeadlineError("no answer in time")]
     await bench.start()
     await bench.ordered()
     _, request = await bench.ordered()
@@ -65,12 +66,12 @@ async def test_an_order_without_an_answer_is_repeated_as_a_new_attempt(bench: An
 
 async def test_an_order_that_breaks_fails_its_attempt_only(bench: Any) -> None:
     """A defect on the way of an order is an attempt that failed, and not a silent wait."""
-    bench.around.refusals = [KeyError("defect")]
+    bench.context.refusals = [KeyError("defect")]
     await bench.start()
     await bench.ordered()
     gateway, request = await bench.ordered()
     assert (gateway, request.attempt) == ("gw-2", 2)
-    failure = bench.driver.record.subtasks[0].attempts[0].failure
+    failure = bench.coordinator.record.subtasks[0].attempts[0].failure
     assert failure is not None
     assert "KeyError" in failure.message
 
@@ -88,7 +89,7 @@ async def test_a_failed_attempt_is_repeated_until_the_skills_retries_are_used(be
 
 async def test_a_plan_that_fails_ends_the_task_with_its_problems(bench: Any) -> None:
     """PlanError becomes a failed task that says why."""
-    bench.around.the_plan = PlanError("no plan", problems=("s1: no such robot",))
+    bench.context.the_plan = PlanError("no plan", problems=("s1: no such robot",))
     await bench.start()
     ended = await bench.end()
     assert ended.state is TaskState.FAILED
@@ -96,8 +97,8 @@ async def test_a_plan_that_fails_ends_the_task_with_its_problems(bench: Any) -> 
 
 
 async def test_a_planner_that_breaks_ends_the_task_too(bench: Any) -> None:
-    """A defect in planning is told, instead of being met again and again."""
-    bench.around.the_plan = RecursionError("too deep")
+    """A defect in planning is reported, instead of being met again and again."""
+    bench.context.the_plan = RecursionError("too deep")
     await bench.start()
     ended = await bench.end()
     assert ended.state is TaskState.FAILED
@@ -106,7 +107,7 @@ async def test_a_planner_that_breaks_ends_the_task_too(bench: Any) -> None:
 
 async def test_cancel_while_planning_ends_it_at_once(bench: Any) -> None:
     """The plan is not waited for."""
-    bench.around.planning = asyncio.Event()
+    bench.context.planning = asyncio.Event()
     await bench.start()
     await asyncio.sleep(0.01)
     bench.say(CancelAsked())
@@ -115,7 +116,7 @@ async def test_cancel_while_planning_ends_it_at_once(bench: Any) -> None:
 
 async def test_a_driver_that_is_stopped_leaves_no_planning_behind(bench: Any) -> None:
     """Planning ends with the driver that wanted it."""
-    bench.around.planning = asyncio.Event()
+    bench.context.planning = asyncio.Event()
     before = asyncio.all_tasks()
 
     async def others(count: int) -> None:
@@ -124,7 +125,7 @@ async def test_a_driver_that_is_stopped_leaves_no_planning_behind(bench: Any) ->
                 await asyncio.sleep(0.001)
 
     await bench.start()
-    await others(3)  # the driver, the planning, and what listens for a cancel
+    await others(2)  # the coordinator and the planning
     bench.task.cancel()
     await asyncio.gather(bench.task, return_exceptions=True)
     await others(0)
@@ -134,7 +135,7 @@ async def test_cancel_is_repeated_until_the_run_has_ended(bench: Any) -> None:
     """The first `run_cancel` may be lost or overtake the order; the end of the run makes the task cancelled."""
     await bench.start()
     _, request = await bench.ordered()
-    bench.around.config = replace(bench.around.config, grace_s=5.0)
+    bench.context.config = replace(bench.context.config, grace_s=5.0)
     bench.say(CancelAsked())
     async with asyncio.timeout(60):
         while sum(verb == "run_cancel" for _, verb, _ in bench.plane.rpc.calls) < 3:
@@ -199,7 +200,7 @@ async def test_a_run_that_ended_without_a_word_is_repeated(bench: Any) -> None:
 
 async def test_a_talkative_run_does_not_hide_a_silent_one(bench: Any) -> None:
     """Checks follow the clock: s2 is found lost although s1 never stops telling."""
-    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work"))
+    bench.context.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work"))
 
     async def status(gateway: str, ask: RunAsk) -> RunStatus:
         return RunStatus(running=ask.subtask == "s1")
@@ -248,22 +249,22 @@ async def test_repeated_failures_of_an_attempt_do_not_put_off_the_next(bench: An
     failure = Failure(code="robot", message="slipped", retryable=True)
     bench.tell(request, FAILED, failure=failure)
     await bench.until(lambda record: record.subtasks[0].state is SubtaskState.READY)
-    due = dict(bench.driver._pace.not_before)
+    due = dict(bench.coordinator._decider._backoff.not_before)
     bench.tell(request, FAILED, failure=failure)
     await asyncio.sleep(0.02)
-    assert bench.driver._pace.not_before == due
+    assert bench.coordinator._decider._backoff.not_before == due
 
 
 async def test_a_record_that_has_moved_on_stops_the_driver_before_it_orders_anything(bench: Any) -> None:
     """Two coordinators: the one whose write conflicts stops, and its order is never sent."""
-    bench.around.planning = asyncio.Event()
+    bench.context.planning = asyncio.Event()
     driver = await bench.start()
     stored = bench.plane.dht.records[task_key("t-1")]
     other = replace(driver.record, coordinator="gw-2", sequence=2)
     await bench.plane.dht.write(task_key("t-1"), encode(other), expected=stored.version)
-    bench.around.planning.set()
+    bench.context.planning.set()
     await bench.end()
-    assert bench.around.orders.empty()
+    assert bench.context.orders.empty()
     assert not driver.ended
     assert bench.stored().coordinator == "gw-2"
 
@@ -282,15 +283,15 @@ async def test_a_final_record_that_could_not_be_written_is_not_an_end(bench: Any
 
 async def test_without_a_robot_it_waits_with_a_note_and_goes_on_when_there_is_one(bench: Any) -> None:
     """The reason is in the written record, for every gateway to tell."""
-    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work", robot="r1"))
-    bench.around.robot = (None, "waits for r1: offline")
+    bench.context.the_plan = bench.plan_of(Subtask(id="s1", skill="work", robot="r1"))
+    bench.context.robot = (None, "waits for r1: offline")
     driver = await bench.start()
     await bench.until(lambda record: bool(record.subtasks) and "offline" in record.subtasks[0].note)
     async with asyncio.timeout(60):
         while not bench.stored().subtasks or "offline" not in bench.stored().subtasks[0].note:
             await asyncio.sleep(0.005)
     assert driver.waits
-    bench.around.robot = ("r1", "")
+    bench.context.robot = ("r1", "")
     bench.say(Wake())
     _, request = await bench.ordered()
     assert request.robot == "r1"
@@ -299,16 +300,16 @@ async def test_without_a_robot_it_waits_with_a_note_and_goes_on_when_there_is_on
 
 async def test_without_a_gateway_it_waits_with_a_note(bench: Any) -> None:
     """Nobody can run it: the record says who is there and why not."""
-    bench.around.places = []
+    bench.context.places = []
     await bench.start()
     await bench.until(lambda record: bool(record.subtasks) and "waits for a gateway" in record.subtasks[0].note)
-    bench.around.places = ["gw-2"]
+    bench.context.places = ["gw-2"]
     assert (await bench.ordered())[0] == "gw-2"
 
 
 async def test_a_skill_that_this_gateway_does_not_know_fails_the_task_with_the_reason(bench: Any) -> None:
     """No KeyError over and over."""
-    bench.around.skills = {}
+    bench.context.skills = {}
     await bench.start()
     ended = await bench.end()
     assert ended.state is TaskState.FAILED
@@ -337,7 +338,7 @@ async def test_strange_numbers_and_endless_notes_are_cut(bench: Any) -> None:
 
 async def test_a_run_that_was_passed_on_is_asked_for_where_it_went(bench: Any) -> None:
     """The gateway that accepted answers for the run."""
-    bench.around.passed_to = "gw-3"
+    bench.context.passed_to = "gw-3"
     await bench.start()
     await bench.ordered()
     await bench.until(lambda record: record.subtasks[0].gateway == "gw-3")
@@ -346,9 +347,23 @@ async def test_a_run_that_was_passed_on_is_asked_for_where_it_went(bench: Any) -
     assert request.attempt == 2
 
 
+async def test_runs_are_asked_for_where_messages_may_be_missing(bench: Any) -> None:
+    """At once, and not when they have been silent for long: the end of the run may be what did not arrive."""
+    await bench.start()
+    _, request = await bench.ordered()
+    ended = RunEvent(
+        task=request.task, subtask=request.subtask, attempt=request.attempt, gateway="gw-1", kind=SUCCEEDED, at_ns=1,
+        result={"x": 1},
+    )  # fmt: skip
+    bench.plane.rpc.on["run_status"] = answer(RunStatus(running=False, last=ended))
+    bench.say(GatewayRelinked("gw-2"))
+    bench.say(GatewayRelinked("gw-1"))
+    assert (await bench.end()).subtasks[0].result == {"x": 1}
+
+
 async def test_a_silent_run_is_given_up_after_its_deadline(bench: Any) -> None:
     """A gateway that says `running` for ever does not hold the task for ever."""
-    bench.around.skills = {"work": replace(bench.around.skills["work"], timeout_s=0.05)}
+    bench.context.skills = {"work": replace(bench.context.skills["work"], timeout_s=0.05)}
     bench.plane.rpc.on["run_status"] = answer(RunStatus(running=True))
     await bench.start()
     await bench.ordered()

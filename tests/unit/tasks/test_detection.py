@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.durations import Condition, DetectionConfig, Known, asked_s, judge, quantile, usual_s
+from appliance.tasks.durations import Condition, Known, asked_s, judge, quantile, usual_s
+from appliance.tasks.settings import DetectionConfig
 
 CONFIG = DetectionConfig()
 QUIET = SkillManifest(id="work", domain="any", summary="works", runs="compute", image="base")

@@ -22,11 +22,13 @@ from appliance.model import (
     RunEventKind,
     RunRequest,
     Way,
+    keyspace,
 )
+from appliance.model.task_api import RunAsk, RunStatus
+from appliance.plane.events import FactsChanged
 from appliance.pool.selection import Decision
-from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.executor import Executor
-from appliance.tasks.offload import Offer, RemoteContainers, UnmeasuredLinks, choose
+from appliance.tasks.offload import Offer, RemoteContainers, choose
 
 pytestmark = pytest.mark.anyio
 
@@ -72,7 +74,7 @@ def ready(gateway: str, image: str = "base") -> ContainerInfo:
 def test_an_offer_is_always_one_that_can_be_taken(
     gateways: dict[str, GatewayStatus], holders: set[str], within: set[str], waited_s: float, expected_s: float | None
 ) -> None:
-    """Never to here, never outside of what is allowed; anew only where there is room, and only when it is worth it."""
+    """Never to here or outside of what is allowed; a new container where there is room, and when it is worth it."""
     offer = choose(
         avoid={"gw-1"},
         ready=[ready(each) for each in sorted(holders)],
@@ -90,7 +92,7 @@ def test_an_offer_is_always_one_that_can_be_taken(
         return
     assert offer.gateway != "gw-1"
     assert not within or offer.gateway in within
-    if not offer.anew:
+    if not offer.new_container:
         assert offer.gateway in allowed
         return
     assert not allowed
@@ -112,7 +114,7 @@ def test_the_right_image_and_the_least_load_are_preferred() -> None:
         avoid={"gw-1"}, ready=[ready("gw-2", "vision"), ready("gw-3"), ready("gw-4")], gateways=gateways, need=NEED,
         within=(), waited_s=0.0, expected_s=None, cold_s=0.5,
     )  # fmt: skip
-    assert found == Offer(gateway="gw-4", anew=False, why="gw-4 has a ready container")
+    assert found == Offer(gateway="gw-4", new_container=False, why="gw-4 has a ready container")
 
 
 # --- the way of a run ------------------------------------------------------------------------------------------
@@ -123,7 +125,7 @@ async def executor(plane: Any, pool: Any, tasks_config: Any) -> AsyncIterator[Ex
     """Return an executor whose pool has everything busy."""
     pool.full = True
     pool.decision = Decision(phase=Phase.COLD, gateway="gw-1", way=Way.NEW, why="a new one")
-    made = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
+    made = Executor(plane, pool, RemoteContainers(plane, successors=3), tasks_config)
     await made.start()
     yield made
     made._passing.stop()
@@ -133,8 +135,7 @@ def hear_of(plane: Any, gateway: str) -> None:
     """A container of another gateway becomes ready, and that is heard."""
     plane.registry.containers[gateway] = {f"c-{gateway}": ready(gateway)}
     plane.registry.ages[gateway] = 0.0
-    for callback in plane.registry.on_change:
-        callback("container")
+    plane.events.publish(FactsChanged("container"))
 
 
 async def until(holds: Any) -> None:
@@ -146,11 +147,13 @@ async def until(holds: Any) -> None:
 
 def told(plane: Any, kind: RunEventKind) -> list[RunEvent]:
     """What was told of the run, of one kind."""
-    return [each for each in plane.session.sent(plane.keys.run("t-1", "s1"), RunEvent) if each.kind is kind]
+    return [
+        each for each in plane.session.sent(plane.keys(keyspace.RUN_EVENT, "t-1", "s1"), RunEvent) if each.kind is kind
+    ]
 
 
 async def test_a_waiting_run_goes_where_a_container_becomes_ready(executor: Executor, plane: Any, pool: Any) -> None:
-    """Accepted here, passed on once, and from then on asked after and cancelled there; no end is told."""
+    """Accepted here, passed on once, and from then on asked after and cancelled there; no end is published."""
     orders: list[tuple[str, RunRequest]] = []
 
     async def take(gateway: str, request: RunRequest) -> RunAccepted:
@@ -167,7 +170,7 @@ async def test_a_waiting_run_goes_where_a_container_becomes_ready(executor: Exec
     assert (await executor.status(ASK)).position == 1
     hear_of(plane, "gw-2")
     await until(lambda: executor.running == 0)
-    assert [(gateway, order.hops, order.anew) for gateway, order in orders] == [("gw-2", 1, False)]
+    assert [(gateway, order.hops, order.new_container) for gateway, order in orders] == [("gw-2", 1, False)]
     moved = told(plane, RunEventKind.PROGRESS)[-1]
     assert moved.gateway == "gw-2"
     assert moved.choice is not None
@@ -183,7 +186,7 @@ async def test_a_pool_that_keeps_to_itself_offers_nothing(plane: Any, pool: Any,
     """With `pool.mode` local or cold, which are there to be compared with, a run waits where it was ordered."""
     pool.full, pool.federated = True, False
     pool.decision = Decision(phase=Phase.COLD, gateway="gw-1", way=Way.NEW, why="a new one")
-    executor = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
+    executor = Executor(plane, pool, RemoteContainers(plane, successors=3), tasks_config)
     await executor.start()
     await executor.run(REQUEST)
     await until(lambda: pool.line)
@@ -289,7 +292,7 @@ async def test_runs_stay_that_were_passed_on_that_need_state_or_that_may_not_go(
 ) -> None:
     """One hop is the most; state is on its way here already; a group is a limit."""
     stay = (
-        replace(REQUEST, subtask="a", hops=1, anew=True),
+        replace(REQUEST, subtask="a", hops=1, new_container=True),
         replace(REQUEST, subtask="b", need=Need(image="base", volumes=("maps",))),
         replace(REQUEST, subtask="c", group=("gw-1", "gw-3")),
     )
@@ -305,11 +308,11 @@ async def test_runs_stay_that_were_passed_on_that_need_state_or_that_may_not_go(
 async def test_a_run_passed_on_to_be_started_anew_is_refused_where_there_is_no_room(
     executor: Executor, pool: Any
 ) -> None:
-    """Whoever asks has a queue itself: it must not get into another one. With room, it is a cold start there."""
+    """The asker has a queue itself: it must not get into another one. With room, it is a cold start there."""
     pool.full, pool.room = False, False
     with pytest.raises(RefusedError, match="no room"):
-        await executor.run(replace(REQUEST, hops=1, anew=True))
+        await executor.run(replace(REQUEST, hops=1, new_container=True))
     with pytest.raises(RefusedError, match="no ready container"):
         await executor.run(replace(REQUEST, attempt=2, hops=1))
     pool.room = True
-    assert (await executor.run(replace(REQUEST, attempt=3, hops=1, anew=True))).phase is Phase.COLD
+    assert (await executor.run(replace(REQUEST, attempt=3, hops=1, new_container=True))).phase is Phase.COLD

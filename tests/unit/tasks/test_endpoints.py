@@ -8,11 +8,11 @@ from msgspec.structs import replace
 
 from appliance.errors import NotFoundError
 from appliance.model import GatewayStatus, RunEvent, RunEventKind, Site, Subtask, SubtaskState, TaskRequest, TaskState
+from appliance.model.task_api import RunAsk, RunStatus, WhyAsk
 from appliance.reasons import why_text
-from appliance.tasks.api import RunAsk, RunStatus, WhyAsk
 from appliance.tasks.manager import TaskManager
 
-from .test_manager import AgreeableDecomposer, FakeExecutor, until
+from .test_manager import AgreeableDecomposer, never, until
 
 pytestmark = pytest.mark.anyio
 
@@ -20,9 +20,10 @@ pytestmark = pytest.mark.anyio
 @pytest.fixture
 async def manager(plane: Any, tasks_config: Any, catalogue: Any) -> AsyncIterator[TaskManager]:
     """Return a manager of gw-1 that knows three gateways: one full, one draining, one too small."""
+    plane.rpc.on["run"] = never
     made = TaskManager(
         tasks_config, plane=plane, catalogue=catalogue, decomposer=cast("Any", AgreeableDecomposer()),
-        executor=cast("Any", FakeExecutor()), site=Site(),
+        site=Site(),
     )  # fmt: skip
     plane.registry.gateways = {
         "gw-1": GatewayStatus(id="gw-1", fleet="f", capacity=1, running=2),
@@ -52,7 +53,7 @@ async def test_a_wait_for_room_is_explained(manager: TaskManager, plane: Any) ->
     await waiting(manager, "t-1")
     await manager.submit(wish(plane, "t-2", submitter="ann", priority=2, deadline_s=100.0))
     await waiting(manager, "t-2")
-    found = await manager.why(WhyAsk(id="t-2"))
+    found = await manager.questions.why(WhyAsk(id="t-2"))
     assert (found.priority, found.submitter) == (2, "ann")
     assert found.left_s is not None
     assert 0 < found.left_s <= 100
@@ -69,9 +70,9 @@ async def test_a_wait_for_room_is_explained(manager: TaskManager, plane: Any) ->
     assert told["gw-2"].excluded
     assert told["gw-3"].excluded
     assert second.reason == "comes after s1"
-    assert [each.id for each in (await manager.why(WhyAsk(id="t-2", subtask="s1"))).subtasks] == ["s1"]
+    assert [each.id for each in (await manager.questions.why(WhyAsk(id="t-2", subtask="s1"))).subtasks] == ["s1"]
     with pytest.raises(NotFoundError, match="s9"):
-        await manager.why(WhyAsk(id="t-2", subtask="s9"))
+        await manager.questions.why(WhyAsk(id="t-2", subtask="s9"))
     assert why_text(found)
 
 
@@ -84,14 +85,14 @@ async def test_a_run_in_a_gateways_queue_is_asked_after_there(manager: TaskManag
     plane.rpc.on["run_status"] = status
     plane.registry.gateways["gw-1"] = replace(plane.registry.gateways["gw-1"], running=0)
     await manager.submit(wish(plane, "t-1"))
-    await until(lambda: manager._drivers["t-1"].record.state is TaskState.RUNNING)
-    await until(lambda: manager._drivers["t-1"].record.subtasks[0].state is SubtaskState.DISPATCHED)
-    waits = (await manager.why(WhyAsk(id="t-1"))).subtasks[0].waits
+    await until(lambda: manager._coordinators["t-1"].record.state is TaskState.RUNNING)
+    await until(lambda: manager._coordinators["t-1"].record.subtasks[0].state is SubtaskState.DISPATCHED)
+    waits = (await manager.questions.why(WhyAsk(id="t-1"))).subtasks[0].waits
     assert waits is not None
     assert (waits.at, waits.position, waits.waiting, waits.expected_s) == ("gw-1", 3, 7, 1.2)
     started = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.STARTED, gateway="gw-1")
     manager._on_run_event("swiftbot/f/task/t-1/run/s1", started)
-    await until(lambda: manager._drivers["t-1"].record.subtasks[0].state is SubtaskState.RUNNING)
-    running = (await manager.why(WhyAsk(id="t-1"))).subtasks[0].waits
+    await until(lambda: manager._coordinators["t-1"].record.subtasks[0].state is SubtaskState.RUNNING)
+    running = (await manager.questions.why(WhyAsk(id="t-1"))).subtasks[0].waits
     assert running is not None
     assert running.reason == "nothing: it runs"

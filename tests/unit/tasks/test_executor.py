@@ -8,14 +8,7 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from appliance.errors import (
-    DeadlineError,
-    NotFoundError,
-    PayloadError,
-    RefusedError,
-    SwiftbotError,
-    UnreachableError,
-)
+from appliance.errors import DeadlineError, NotFoundError, PayloadError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import (
     Attempt,
     Choice,
@@ -32,13 +25,15 @@ from appliance.model import (
     TaskState,
     Way,
     encode,
+    keyspace,
 )
+from appliance.model.task_api import RunAsk, RunStatus
 from appliance.pool.selection import Decision
-from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.checkpoints import read_checkpoint
-from appliance.tasks.context import task_key
 from appliance.tasks.executor import Executor
-from appliance.tasks.offload import RemoteContainers, UnmeasuredLinks
+from appliance.tasks.handoff import Reservations
+from appliance.tasks.offload import RemoteContainers
+from appliance.tasks.records import task_key
 
 pytestmark = pytest.mark.anyio
 
@@ -51,7 +46,7 @@ AWAY = Decision(phase=Phase.REMOTE_WARM, gateway="gw-2", container="c2")
 @pytest.fixture
 async def executor(plane: Any, pool: Any, tasks_config: Any) -> Executor:
     """Return an executor that hears records."""
-    made = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
+    made = Executor(plane, pool, RemoteContainers(plane, successors=3), tasks_config)
     await made.start()
     return made
 
@@ -70,10 +65,10 @@ async def finish(pool: Any, run_id: str = "t-1/s1/1", **fields: Any) -> None:
 
 
 async def last_event(plane: Any) -> RunEvent:
-    """Wait for the final event that is told."""
+    """Wait for the final event that is published."""
     async with asyncio.timeout(60):
         while True:
-            told = plane.session.sent(plane.keys.run("t-1", "s1"), RunEvent)
+            told = plane.session.sent(plane.keys(keyspace.RUN_EVENT, "t-1", "s1"), RunEvent)
             if told and told[-1].kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
                 return told[-1]
             await asyncio.sleep(0.001)
@@ -139,6 +134,19 @@ async def test_an_order_is_passed_on_once(executor: Executor, plane: Any, pool: 
         await executor.run(replace(REQUEST, subtask="s2", hops=1))
 
 
+async def test_an_order_gets_the_container_that_is_held_for_it(plane: Any, pool: Any, tasks_config: Any) -> None:
+    """Nothing is selected for it again, and it is not passed on, wherever a better one may be by now."""
+    reservations = Reservations("gw-1", pool)
+    executor = Executor(plane, pool, RemoteContainers(plane, successors=3), tasks_config, reservations=reservations)
+    await executor.start()
+    held = await reservations.reserve(REQUEST)
+    assert reservations.hold(REQUEST.run_id, held)
+    pool.decisions, pool.asked = [AWAY], []
+    assert (await executor.run(REQUEST)).container == "c1"
+    assert pool.asked == []
+    await finish(pool)
+
+
 async def test_whoever_asks_after_a_run_that_was_passed_on_learns_where_it_is(
     executor: Executor, plane: Any, pool: Any, tasks_config: Any
 ) -> None:
@@ -162,10 +170,10 @@ async def test_whoever_asks_after_a_run_that_was_passed_on_learns_where_it_is(
     await executor.cancel(ASK)
     assert plane.rpc.calls[-1] == ("gw-2", "run_cancel", ASK)
     await until(lambda: plane.store.values)
-    again = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
+    again = Executor(plane, pool, RemoteContainers(plane, successors=3), tasks_config)
     await again.start()
     assert (await again.status(ASK)).running
-    plane.session.put(plane.keys.task("t-1"), encode(replace(plane.accepted(), state=TaskState.CANCELLED)))
+    plane.session.publish(keyspace.TASK_UPDATE, replace(plane.accepted(), state=TaskState.CANCELLED), "t-1")
     await until(lambda: not plane.store.values)
     assert await again.status(ASK) == await executor.status(ASK) == RunStatus(running=False)
 
@@ -244,7 +252,7 @@ async def test_a_run_is_ended_when_its_task_moves_on_or_ends(executor: Executor,
     draining = asyncio.create_task(executor.drain(60.0))
     await until(lambda: executor.draining)
     record = plane.accepted()
-    plane.session.put(plane.keys.task("t-1"), encode(replace(record, state=TaskState.CANCELLED)))
+    plane.session.publish(keyspace.TASK_UPDATE, replace(record, state=TaskState.CANCELLED), "t-1")
     await until(lambda: pool.cancelled)
     assert pool.cancelled == ["t-1/s1/1"]
     await finish(pool)
@@ -259,7 +267,7 @@ async def test_a_restart_tells_of_lost_runs_and_skips_what_it_cannot_read(
     """A run in progress at the end has failed, retryable; a damaged row does not keep the gateway from starting."""
     begun = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.STARTED)
     plane.store.values = {"run/t-1/s1/1": encode(begun), "run/t-1/s2/1": b"\xff"}
-    executor = Executor(plane, pool, RemoteContainers(plane, successors=3, links=UnmeasuredLinks()), tasks_config)
+    executor = Executor(plane, pool, RemoteContainers(plane, successors=3), tasks_config)
     await executor.start()
     status = await executor.status(ASK)
     assert not status.running
@@ -331,7 +339,7 @@ async def test_liars_all_around_end_in_a_cold_start_here(executor: Executor, pla
 async def test_a_gateway_whose_offers_are_nothing_again_and_again_is_left_out(
     executor: Executor, plane: Any, pool: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three in a row, and it is not asked for a while; a good one in between begins anew."""
+    """Three in a row, and it is not asked for a while; a good one in between begins again."""
     monkeypatch.setattr("appliance.tasks.offload.FIRST_LEFT_OUT_S", 10.0)  # or a slow machine is too late to see it
     refuse = True
 
@@ -372,7 +380,7 @@ async def test_a_runs_checkpoints_are_kept_and_told_without_their_data(
     pool.tells["t-1/s1/1"](begun)
     await finish(pool, kind=RunEventKind.FAILED)
     await last_event(plane)
-    told = plane.session.sent(plane.keys.run("t-1", "s1"), RunEvent)
+    told = plane.session.sent(plane.keys(keyspace.RUN_EVENT, "t-1", "s1"), RunEvent)
     kept = [each for each in told if each.kind is RunEventKind.CHECKPOINT]
     assert [each.result for each in kept] == [None]
     kept = await read_checkpoint(plane.dht, "t-1", "s1")
@@ -391,11 +399,11 @@ async def test_a_run_is_not_ended_by_the_word_of_a_coordinator_that_was_succeede
     one = replace(one, subtasks=(SubtaskRecord(subtask=Subtask(id="s1", skill="work"), attempts=(ATTEMPT,)),))
     two = replace(two, subtasks=(replace(one.subtasks[0], attempts=(replace(ATTEMPT, number=2),)),))
     version = await plane.dht.write(task_key("t-1"), encode(one), expected=None)
-    plane.session.put(plane.keys.task("t-1"), encode(two))
+    plane.session.publish(keyspace.TASK_UPDATE, two, "t-1")
     await asyncio.sleep(0.05)
     assert not pool.cancelled
     await plane.dht.write(task_key("t-1"), encode(two), expected=version)
-    plane.session.put(plane.keys.task("t-1"), encode(two))
+    plane.session.publish(keyspace.TASK_UPDATE, two, "t-1")
     async with asyncio.timeout(60):
         while pool.cancelled != ["t-1/s1/1"]:
             await asyncio.sleep(0.005)
@@ -410,7 +418,7 @@ async def test_a_run_of_a_subtask_that_a_revised_plan_left_out_is_ended(
     other = SubtaskRecord(subtask=Subtask(id="r1_1", skill="work"))
     revised = replace(plane.accepted(), subtasks=(other,), retired=("s1",))
     await plane.dht.write(task_key("t-1"), encode(revised), expected=None)
-    plane.session.put(plane.keys.task("t-1"), encode(revised))
+    plane.session.publish(keyspace.TASK_UPDATE, revised, "t-1")
     async with asyncio.timeout(60):
         while pool.cancelled != ["t-1/s1/1"]:
             await asyncio.sleep(0.005)

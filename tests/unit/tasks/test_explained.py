@@ -20,10 +20,11 @@ from appliance.model import (
     TaskState,
     Way,
     encode,
+    keyspace,
 )
-from appliance.tasks import coordinator, machine, orders
-from appliance.tasks.checkpoints import Checkpoint
-from appliance.tasks.coordinator import MAX_PARTIAL_BYTES, Partials, shown
+from appliance.tasks import coordinator, decide, machine
+from appliance.tasks.checkpoints import Checkpoint, checkpoint_key
+from appliance.tasks.decide import MAX_PARTIAL_BYTES, PartialResults, shown
 from appliance.tasks.machine import KEPT_CHOICES, Transition, TransitionKind
 
 pytestmark = pytest.mark.anyio
@@ -41,10 +42,10 @@ CHOICE = Choice(
 
 async def test_an_attempt_keeps_why_it_was_placed_and_chosen(bench: Any) -> None:
     """The coarse reason stands from the dispatch, the fine one from the first line of the run."""
-    bench.around.choice = CHOICE
+    bench.context.choice = CHOICE
     await bench.start()
     _, request = await bench.ordered()
-    assert bench.driver.record.subtasks[0].attempts[0].placed == "none is there"
+    assert bench.coordinator.record.subtasks[0].attempts[0].placed == "none is there"
     bench.tell(request, RunEventKind.STARTED, container="c1", phase=Phase.LOCAL_WARM)
     await bench.until(lambda record: record.subtasks[0].state is SubtaskState.RUNNING)
     await bench.until(lambda record: record.subtasks[0].attempts[0].choice == CHOICE)
@@ -57,14 +58,14 @@ async def test_a_run_that_ends_before_its_order_is_answered_is_explained_too(
     bench: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last subtask's end waits a moment for the answer that says how its container was chosen."""
-    monkeypatch.setattr(orders, "ANSWER_S", 60.0)
-    bench.around.choice = CHOICE
-    bench.around.slow_answer = asyncio.Event()
+    monkeypatch.setattr(coordinator, "ANSWER_S", 60.0)
+    bench.context.choice = CHOICE
+    bench.context.slow_answer = asyncio.Event()
     await bench.start()
     _, request = await bench.ordered()
     bench.tell(request, RunEventKind.SUCCEEDED)
     await asyncio.sleep(0.02)
-    bench.around.slow_answer.set()
+    bench.context.slow_answer.set()
     ended = await bench.end()
     assert ended.state is TaskState.SUCCEEDED
     assert ended.subtasks[0].attempts[0].choice == CHOICE
@@ -72,7 +73,7 @@ async def test_a_run_that_ends_before_its_order_is_answered_is_explained_too(
 
 async def test_an_answer_that_never_comes_holds_nothing_up(bench: Any) -> None:
     """After a quarter of a second the end is taken without it."""
-    bench.around.slow_answer = asyncio.Event()
+    bench.context.slow_answer = asyncio.Event()
     await bench.start()
     _, request = await bench.ordered()
     bench.tell(request, RunEventKind.SUCCEEDED)
@@ -83,7 +84,9 @@ async def test_an_answer_that_never_comes_holds_nothing_up(bench: Any) -> None:
 
 async def test_the_next_attempt_goes_on_from_the_last_checkpoint(bench: Any) -> None:
     """A first attempt has none; one that comes after a failure gets what was kept; the end removes it."""
-    bench.around.checkpoints = {"s1": Checkpoint(attempt=1, gateway="gw-1", at_ns=1, data={"at": 3}, calls=2)}
+    saved = Checkpoint(attempt=1, gateway="gw-1", at_ns=1, data={"at": 3}, calls=2)
+    key = checkpoint_key("t-1", "s1")
+    await bench.plane.dht.write(key, encode(saved), expected=None)
     await bench.start()
     _, request = await bench.ordered()
     assert request.resume is None
@@ -98,20 +101,20 @@ async def test_the_next_attempt_goes_on_from_the_last_checkpoint(bench: Any) -> 
     assert (again.resume, again.calls) == ({"at": 3}, 2)
     bench.tell(again, RunEventKind.SUCCEEDED, gateway="gw-2")
     await bench.end()
-    assert bench.around.forgotten == ["t-1"]
+    assert key not in bench.plane.dht.records
 
 
 async def test_the_last_partial_result_is_shown_until_there_is_a_result(
     bench: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Many partial results are few transitions; the newest stands; the result takes its place."""
-    monkeypatch.setattr(coordinator, "EVERY_S", 0.05)
+    monkeypatch.setattr(decide, "PARTIAL_EVERY_S", 0.05)
     await bench.start()
     _, request = await bench.ordered()
     for number in range(100):
         bench.tell(request, RunEventKind.PARTIAL, result={"seen": number})
     await bench.until(lambda record: record.subtasks[0].partial == {"seen": 99})
-    told = bench.plane.session.sent(bench.plane.keys.transition("t-1"), Transition)
+    told = bench.plane.session.sent(bench.plane.keys(keyspace.TRANSITION, "t-1"), Transition)
     assert sum(each.kind is TransitionKind.PARTIAL for each in told) <= 3
     bench.tell(request, RunEventKind.SUCCEEDED, result={"seen": 100})
     assert (await bench.end()).subtasks[0].partial is None
@@ -119,7 +122,7 @@ async def test_the_last_partial_result_is_shown_until_there_is_a_result(
 
 def test_partials_wait_for_their_turn() -> None:
     """One a second for each subtask; what an ended attempt told is dropped."""
-    waiting = Partials()
+    waiting = PartialResults()
 
     def told(subtask: str, number: int) -> RunEvent:
         return RunEvent(task="t", subtask=subtask, attempt=1, kind=RunEventKind.PARTIAL, result={"n": number})
@@ -179,11 +182,11 @@ def test_records_from_before_still_decode() -> None:
 
 async def test_a_refused_order_leaves_its_reason_in_the_attempt(bench: Any) -> None:
     """An attempt that was never served has a failure and no choice."""
-    bench.around.refusals = [RefusedError("gw-1 is draining")]
+    bench.context.refusals = [RefusedError("gw-1 is draining")]
     await bench.start()
     await bench.ordered()
     _, again = await bench.ordered()
     assert again.attempt == 2
-    first = bench.driver.record.subtasks[0].attempts[0]
+    first = bench.coordinator.record.subtasks[0].attempts[0]
     assert first.choice is None
     assert first.failure is not None

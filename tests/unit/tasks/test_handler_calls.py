@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.errors import PayloadError, RefusedError, RobotError
-from appliance.model import Failure, Need, Notice, RobotCommand, RobotInfo, RobotReply, RunRequest, encode
+from appliance.model import Failure, Need, Notice, RobotCommand, RobotInfo, RobotReply, RunRequest, encode, keyspace
 from appliance.pool.pool import Call
 from appliance.tasks import handler_calls as module
 from appliance.tasks.artifacts import Artifacts
@@ -39,7 +39,7 @@ def ask(name: str, run: RunRequest = RUN, /, **args: Any) -> Call:
 
 
 async def test_a_busy_robot_is_waited_for_with_a_note(calls: Calls, plane: Any, waits: list[str]) -> None:
-    """Busy is no failure: it is asked again under the same id, and people are told."""
+    """Busy is no failure: it is asked again under the same id, and people get a notice."""
     busy = RobotReply(id="t-1/s1/1", failure=Failure(code="busy", message="arm in use"))
     plane.session.replies = [encode(busy), encode(busy), encode(RobotReply(id="t-1/s1/1", result={"at": "dock"}))]
     assert await calls(ask("command", verb="goto", args={})) == {"at": "dock"}
@@ -153,7 +153,7 @@ async def test_a_notice_is_sent_once_across_attempts(calls: Calls, plane: Any) -
     await calls(ask("notify", to="Opérator ", text="done \ud800"))
     again = await calls(ask("notify", replace(RUN, attempt=2), to="Opérator ", text="done"))
     assert again["repeated"]
-    sent = plane.session.sent(plane.keys.notice("op_rator"), Notice)
+    sent = plane.session.sent(plane.keys(keyspace.NOTICE, "op_rator"), Notice)
     assert [each.id for each in sent] == ["t-1/s1/1"]
 
 
@@ -161,7 +161,7 @@ async def test_a_notice_that_was_begun_and_not_sent_is_sent(calls: Calls, plane:
     """A gateway that died between the promise and the sending loses nothing."""
     await plane.dht.write("effect/t-1/s1/1", b'{"done":false}', expected=None)
     await calls(ask("notify", replace(RUN, attempt=2), to="operator", text="done"))
-    assert len(plane.session.sent(plane.keys.notice("operator"), Notice)) == 1
+    assert len(plane.session.sent(plane.keys(keyspace.NOTICE, "operator"), Notice)) == 1
 
 
 async def test_a_file_is_kept_and_found_again(calls: Calls) -> None:

@@ -22,14 +22,16 @@ from appliance.model import (
     TaskState,
     Word,
     encode,
+    keyspace,
 )
+from appliance.model.task_api import RunAsk, RunStatus
+from appliance.model.transitions import Transition, TransitionKind
 from appliance.plane.dht import Record
-from appliance.tasks.api import RunAsk, RunStatus
 from appliance.tasks.conflicts import foreign, heal, merged, split_of
-from appliance.tasks.context import RunNews, task_key
+from appliance.tasks.events import RunReported
 from appliance.tasks.machine import apply
-from appliance.tasks.record_writer import Keeper, SupersededError
-from appliance.tasks.transition import Transition, TransitionKind
+from appliance.tasks.record_writer import Draft, RecordWriter, SupersededError
+from appliance.tasks.records import task_key
 
 pytestmark = pytest.mark.anyio
 
@@ -70,7 +72,7 @@ def test_doubled_runs_are_ended_and_later_attempts_fenced_off(plane: Any) -> Non
     assert "attempt 3 on gw-2: it had succeeded" in note
     again = heal(replace(record, sequence=record.sequence + 3, coordinator="gw-2"))
     assert again is not None
-    assert again.noted == healing.noted, "whoever settles it tells it under the same name"
+    assert again.noted == healing.noted, "each gateway that settles it publishes it under the same name"
     after = apply(record, _step(4, TransitionKind.HEALED, splits=healing.splits, fences=healing.fences))
     assert heal(after) is None
     assert after.subtasks[0].next_attempt == 5
@@ -114,7 +116,7 @@ def test_news_of_a_run_that_lost_are_refused_even_under_the_same_number(plane: A
 
 
 async def test_a_driver_settles_what_was_lost_before_it_goes_on(bench: Any) -> None:
-    """The run of the other side is ended there, its result is refused, people are told, the task ends by its own."""
+    """The run of the other side is ended there, its result is refused, with a notice, and the task ends by its own."""
     record = record_of(bench.plane, split(lost(1, "gw-3")))
 
     async def running(gateway: str, ask: RunAsk) -> RunStatus:
@@ -124,7 +126,7 @@ async def test_a_driver_settles_what_was_lost_before_it_goes_on(bench: Any) -> N
     await bench.start(record)
     await bench.until(lambda found: bool(found.splits) and found.splits[0].settled)
     async with asyncio.timeout(60):
-        while not bench.plane.session.sent(bench.plane.keys.notice(), Notice):
+        while not bench.plane.session.sent(bench.plane.keys(keyspace.NOTICE), Notice):
             await asyncio.sleep(0.005)
     ended = [(gateway, ask.attempt) for gateway, verb, ask in bench.plane.rpc.calls if verb == "run_cancel"]
     assert ended == [("gw-3", 1)]
@@ -132,7 +134,7 @@ async def test_a_driver_settles_what_was_lost_before_it_goes_on(bench: Any) -> N
         event = RunEvent(
             task="t-1", subtask="s1", attempt=1, kind=RunEventKind.SUCCEEDED, gateway=gateway, result={"of": gateway}
         )
-        bench.driver.tell(RunNews(event))
+        bench.coordinator.put(RunReported(event))
     last = await bench.end()
     assert last.subtasks[0].result == {"of": "gw-1"}
     assert "partition" in bench.stored().splits[0].note
@@ -144,9 +146,9 @@ async def test_an_ended_task_tells_what_went_on_elsewhere(plane: Any) -> None:
     plane.dht.records[task_key("t-1")] = Record(key=task_key("t-1"), value=encode(record), version={"gw-1": 7})
     healing = heal(record)
     assert healing is not None
-    await healing.settle(plane, Keeper(plane, record, {"gw-1": 7}, lambda _: None))
+    await healing.settle(plane, RecordWriter(plane, Draft(record, "gw-1"), {"gw-1": 7}))
     assert [(gateway, verb) for gateway, verb, _ in plane.rpc.calls] == [("gw-3", "run_cancel")]
-    assert plane.session.sent(plane.keys.task(), TaskRecord)[-1].splits[0].settled
+    assert plane.session.sent(plane.keys(keyspace.TASK_UPDATE), TaskRecord)[-1].splits[0].settled
 
 
 def met(plane: Any, one: TaskRecord, other: TaskRecord) -> TaskRecord:
@@ -160,7 +162,7 @@ CANCEL = Word(by="ann", why="wrong room", act="o-1", at_ns=5)
 
 
 async def test_whoever_gave_an_order_that_lost_gets_a_notice(plane: Any) -> None:
-    """A cancel was answered as done on one side, the other went on to the end: its operator is told, once."""
+    """A cancel was answered as done on one side, the other went on to the end: its operator gets a notice, once."""
     base = record_of(plane)
     cancelled = replace(base, state=TaskState.CANCELLED, cancelled_by=CANCEL, coordinator="gw-2", sequence=5)
     done = tuple(replace(each, state=SubtaskState.SUCCEEDED) for each in base.subtasks)
@@ -170,11 +172,11 @@ async def test_whoever_gave_an_order_that_lost_gets_a_notice(plane: Any) -> None
     healing = heal(record)
     assert healing is not None
     plane.dht.records[task_key("t-1")] = Record(key=task_key("t-1"), value=encode(record), version={"gw-1": 7})
-    await healing.settle(plane, Keeper(plane, record, {"gw-1": 7}, lambda _: None))
-    (notice,) = plane.session.sent(plane.keys.notice("ann"), Notice)
+    await healing.settle(plane, RecordWriter(plane, Draft(record, "gw-1"), {"gw-1": 7}))
+    (notice,) = plane.session.sent(plane.keys(keyspace.NOTICE, "ann"), Notice)
     assert "the cancel of task t-1 by ann is void" in notice.text
     assert "(succeeded)" in notice.text
-    assert notice.id == "t-1/healed/order-o-1", "the same whoever tells it"
+    assert notice.id == "t-1/healed/order-o-1", "the same from each gateway"
     settled = msgspec.json.decode(plane.dht.records[task_key("t-1")].value, type=TaskRecord)
     assert "void" in settled.splits[0].note
     assert heal(settled) is None
@@ -217,7 +219,7 @@ def test_an_operator_whose_name_is_no_key_is_told_as_an_operator(plane: Any) -> 
 
 
 def test_fences_survive_the_loss_of_the_version_that_set_them(plane: Any) -> None:
-    """Settled in a version that lost in its turn: no number is given twice, runs are ended, nobody is told twice."""
+    """Settled in a version that lost in its turn: no number is given twice, runs are ended, no notice comes twice."""
     settled = replace(split(lost(3, "gw-3")), settled=True, note="told")
     record = record_of(plane, settled)
     healing = heal(record)
@@ -234,11 +236,28 @@ def test_fences_survive_the_loss_of_the_version_that_set_them(plane: Any) -> Non
 
 
 async def test_people_are_told_though_another_gateway_settles_at_once(plane: Any) -> None:
-    """Whose write stands is not known to whoever is refused, and the mark of either outlives: both tell the same."""
+    """The refused side does not know whose write stands, and the mark of either outlives: both publish the same."""
     record = record_of(plane, split(lost(2, "gw-3")))
     healing = heal(record)
     assert healing is not None
     plane.dht.records[task_key("t-1")] = Record(key=task_key("t-1"), value=encode(record), version={"gw-2": 8})
     with pytest.raises(SupersededError):
-        await healing.settle(plane, Keeper(plane, record, {"gw-1": 7}, lambda _: None))
-    assert [each.id for each in plane.session.sent(plane.keys.notice(), Notice)] == ["t-1/healed/gw-3-9"]
+        await healing.settle(plane, RecordWriter(plane, Draft(record, "gw-1"), {"gw-1": 7}))
+    assert [each.id for each in plane.session.sent(plane.keys(keyspace.NOTICE), Notice)] == ["t-1/healed/gw-3-9"]
+
+
+@pytest.mark.parametrize(("stands", "ended"), [("gw-1", [("gw-3", "run_cancel")]), ("gw-3", [])])
+async def test_doubled_runs_are_ended_though_the_write_is_refused(
+    plane: Any, stands: str, ended: list[tuple[str, str]]
+) -> None:
+    """Another gateway wrote meanwhile: a run that the record does not have is ended, one that it has goes on."""
+    record = record_of(plane, split(lost(1, "gw-3")))
+    healing = heal(record)
+    assert healing is not None
+    (target,) = record.subtasks
+    (attempt,) = target.attempts
+    newer = replace(record, subtasks=(replace(target, gateway=stands, attempts=(replace(attempt, gateway=stands),)),))
+    plane.dht.records[task_key("t-1")] = Record(key=task_key("t-1"), value=encode(newer), version={"gw-2": 8})
+    with pytest.raises(SupersededError):
+        await healing.settle(plane, RecordWriter(plane, Draft(record, "gw-1"), {"gw-1": 7}))
+    assert [(gateway, verb) for gateway, verb, _ in plane.rpc.calls] == ended

@@ -1,4 +1,4 @@
-"""Plan hints: what is worked out from a plan, when it is told again, and that it never gets in the way."""
+"""Plan hints: what is worked out from a plan, when it is sent again, and that it never gets in the way."""
 
 import asyncio
 from typing import Any
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from appliance.errors import UnreachableError
 from appliance.model import Need, Plan, PoolHint, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
-from appliance.pool.api import Hinted
+from appliance.model.pool_api import Hinted
 from appliance.tasks.durations import DEFAULT_S, WINDOW, Durations
 from appliance.tasks.lookahead import AGAIN_S, HORIZON_S, MOST_AT_ONCE, MOST_KEEP_S, Hinting, expected_starts, hints
 
@@ -79,7 +79,7 @@ def plans(draw: st.DrawFn) -> TaskRecord:
 
 @given(plans(), st.floats(0, 1000), st.floats(0, 1000), st.sampled_from(("gw-1", "gw-2", "")))
 def test_hints_are_bounded_whatever_the_plan(record: TaskRecord, took: float, running: float, place: str) -> None:
-    """Only waiting subtasks count, times are not negative, and what is told can be followed."""
+    """Only waiting subtasks count, times are not negative, and what is sent can be followed."""
     names = [each.subtask.id for each in record.subtasks]
     waiting = {each.subtask.id for each in record.subtasks if each.state is SubtaskState.WAITING}
     seconds = dict.fromkeys(names, took)
@@ -103,7 +103,7 @@ def test_a_circle_does_not_hang() -> None:
 
 
 class Gateways:
-    """Who is told what; `gate` holds answers back."""
+    """Who gets which hint; `gate` holds answers back."""
 
     def __init__(self) -> None:
         self.told: list[tuple[str, PoolHint]] = []
@@ -195,19 +195,19 @@ async def test_durations_are_the_median_of_what_was_measured(plane: Any) -> None
 
 
 async def test_a_driver_looks_ahead_when_subtasks_move(bench: Any) -> None:
-    """Each step of the plan is told once, and durations of what succeeded are noted."""
+    """Each step of the plan is announced once, and durations of what succeeded are noted."""
     plan = Plan(domain="any", subtasks=(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",))))
-    bench.around.the_plan = plan
+    bench.context.the_plan = plan
     await bench.start()
     _, request = await bench.ordered()
     bench.tell(request, "succeeded", duration_ms=1200.0)
     _, request = await bench.ordered()
     bench.tell(request, "succeeded", duration_ms=800.0)
     await bench.end()
-    states = [states for states, _ in bench.around.moved]
+    states = [states for states, _ in bench.context.moved]
     assert ("dispatched", "waiting") in states
     assert all(len(set(states)) > 1 or "waiting" in states for states in states[:-1])
-    assert bench.around.durations == [("work", 1200.0), ("work", 800.0)]
+    assert bench.context.took == [("work", 1200.0), ("work", 800.0)]
 
 
 async def test_a_task_of_one_subtask_tells_nobody_anything(bench: Any) -> None:
@@ -216,4 +216,4 @@ async def test_a_task_of_one_subtask_tells_nobody_anything(bench: Any) -> None:
     _, request = await bench.ordered()
     bench.tell(request, "succeeded")
     await bench.end()
-    assert bench.around.moved == []
+    assert bench.context.moved == []

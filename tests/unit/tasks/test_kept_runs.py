@@ -34,7 +34,7 @@ async def test_of_too_many_runs_the_oldest_go(monkeypatch: pytest.MonkeyPatch) -
 
 
 async def test_after_a_restart_what_ran_has_failed_and_what_was_passed_on_is_known() -> None:
-    """An outcome stands, a run in progress is told as lost, one elsewhere is asked after there, rubbish is dropped."""
+    """An outcome stands, a run in progress counts as lost, one elsewhere is asked after there, rubbish is dropped."""
     store = FakeStore()
     store.values = {
         "run/t-1/s1/2": encode(told("t-1", 2)),

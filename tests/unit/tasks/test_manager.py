@@ -20,7 +20,6 @@ from appliance.model import (
     Approval,
     Decision,
     Plan,
-    PoolHint,
     RobotInfo,
     RunEvent,
     RunEventKind,
@@ -33,35 +32,21 @@ from appliance.model import (
     TaskRequest,
     TaskState,
     encode,
+    keyspace,
 )  # fmt: skip
+from appliance.model.task_api import CancelTaskAsk, RetryAsk, TaskAsk, TasksAsk, WhyAsk
 from appliance.model.tasks import LostRun
 from appliance.plane.dht import Record
-from appliance.pool.api import Hinted
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import machine
 from appliance.tasks import manager as module
-from appliance.tasks.api import CancelTaskAsk, RetryAsk, TaskAsk, TasksAsk, WhyAsk
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.plans import Plans
-from appliance.tasks.records import read_record
-from appliance.tasks.retention import trimmed
+from appliance.tasks.records import read_record, trimmed
 from appliance.tasks.settings import TasksConfig
 
 pytestmark = pytest.mark.anyio
-
-
-class FakeExecutor:
-    """Takes no order."""
-
-    async def run(self, request: object) -> object:
-        """Never answer."""
-        await asyncio.Event().wait()
-        return request
-
-    async def hint(self, hint: PoolHint) -> Hinted:
-        """Follow no hint."""
-        return Hinted(taken=False, why=f"no pool for {hint.image}")
 
 
 class AgreeableDecomposer:
@@ -76,20 +61,32 @@ class AgreeableDecomposer:
         return Review()
 
 
+async def never(gateway: str, request: object) -> object:
+    """Take an order, and do not answer."""
+    await asyncio.Event().wait()
+    return gateway, request
+
+
 @pytest.fixture
 async def manager(plane: Any, tasks_config: Any, catalogue: Any) -> AsyncIterator[TaskManager]:
     """Return a started manager without gateways, so that tasks wait; stopped afterwards."""
+    plane.rpc.on["run"] = never
     made = TaskManager(
         tasks_config,
         plane=plane,
         catalogue=catalogue,
         decomposer=cast("Any", AgreeableDecomposer()),
-        executor=cast("Any", FakeExecutor()),
         site=Site(),
     )
     await made.start()
     yield made
     await made.stop()
+
+
+def state_of(manager: TaskManager, *, written: bool = False) -> TaskState | None:
+    """Return the state of the task that is coordinated here, as it is known or as it is written; None without one."""
+    found = manager.coordinator("t-1")
+    return None if found is None else (found.written if written else found.record).state
 
 
 def wish(plane: Any, task: str = "t-1") -> TaskRequest:
@@ -115,7 +112,7 @@ async def test_a_known_id_is_the_same_task_and_is_driven(manager: TaskManager, p
 @pytest.mark.parametrize("submitter", ["", "ann", "rover_1"])
 @pytest.mark.parametrize("text", ["stop", "HALT!", "rover_1: stop"])
 async def test_a_stop_is_no_task(manager: TaskManager, plane: Any, text: str, submitter: str) -> None:
-    """Whoever hands it in: an operator's tool carries it out, robots and scripts are told the command."""
+    """From each submitter: an operator's tool carries it out, robots and scripts get the command to use."""
     with pytest.raises(RefusedError, match="this is a stop, not a task") as refused:
         await manager.submit(TaskRequest(instruction=text, submitter=submitter))
     assert refused.value.remedy.startswith("swiftbot stop")
@@ -127,7 +124,7 @@ async def test_a_stop_is_no_task(manager: TaskManager, plane: Any, text: str, su
 async def test_a_plan_that_is_too_long_is_refused_before_it_is_a_task(
     manager: TaskManager, plane: Any, verb: str
 ) -> None:
-    """Whoever hands it in, with the limit and what to do about it: no task is made of it that would fail later."""
+    """From each submitter, with the limit and what to do about it: no task is made of it that would fail later."""
     step = plane.plan_of().subtasks[0]
     subtasks = tuple(replace(step, id=f"s{number}", after=()) for number in range(65))
     request = TaskRequest(instruction="work", id="t-1", plan=Plan(domain="navigation", subtasks=subtasks))
@@ -183,10 +180,10 @@ async def test_a_key_that_is_anothers_is_let_go(manager: TaskManager, plane: Any
 async def test_a_task_whose_end_could_not_be_written_is_driven_again(manager: TaskManager, plane: Any) -> None:
     """Final in memory is not final: the next driver cancels it again and writes that."""
     await manager.submit(wish(plane))
-    await until(lambda: manager._drivers["t-1"].record.state is TaskState.RUNNING)
+    await until(lambda: manager._coordinators["t-1"].record.state is TaskState.RUNNING)
     await asyncio.sleep(0.05)
     plane.dht.break_next = [UnreachableError("no owner")]
-    answer = await manager.cancel(CancelTaskAsk(id="t-1"))
+    answer = await manager.questions.cancel(CancelTaskAsk(id="t-1"))
     assert answer.state in (TaskState.CANCELLING, TaskState.CANCELLED)
     await until(lambda: manager.unfinished == 0)
     assert read_record(plane.dht.records["task/t-1"].value).state is TaskState.CANCELLED
@@ -200,7 +197,7 @@ async def test_a_driver_that_breaks_again_and_again_ends_its_task_with_the_reaso
     await manager.submit(wish(plane))
     plane.dht.break_next = [PayloadError("the record is too large")]
     async with asyncio.timeout(60):
-        while not (record := await manager.task(TaskAsk(id="t-1"))).state.final:
+        while not (record := await manager.questions.task(TaskAsk(id="t-1"))).state.final:
             await asyncio.sleep(0.02)
     assert record.state is TaskState.FAILED
     assert record.failure is not None
@@ -217,7 +214,7 @@ async def test_an_unsound_record_is_ended_with_the_reason(manager: TaskManager, 
     await plane.dht.write("task/t-1", encode(forged), expected=None)
     manager._sweep.set()
     async with asyncio.timeout(60):
-        while not (record := await manager.task(TaskAsk(id="t-1"))).state.final:
+        while not (record := await manager.questions.task(TaskAsk(id="t-1"))).state.final:
             await asyncio.sleep(0.02)
     assert record.state is TaskState.FAILED
     assert record.failure is not None
@@ -245,7 +242,7 @@ async def test_fields_of_a_later_version_stay_in_the_record(manager: TaskManager
 async def test_a_flood_of_tasks_does_not_get_past_the_bound_while_records_are_written(
     manager: TaskManager, plane: Any
 ) -> None:
-    """Those that are only being written count as well; whoever asks again for a task that was taken is told of it."""
+    """Those that are only being written count as well; a second request for a task that was taken gets that task."""
     most = manager.config.max_tasks
     wishes = [manager.submit(wish(plane, f"t-{number}")) for number in range(most + 20)]
     answers = await asyncio.gather(*wishes, return_exceptions=True)
@@ -260,11 +257,11 @@ async def test_forged_run_events_are_counted_and_dropped(manager: TaskManager, p
     """Events of gateways that are not there, or under another key, reach no driver; other tasks' are not looked at."""
     await manager.submit(wish(plane))
     event = RunEvent(task="t-1", subtask="s1", attempt=0, kind=RunEventKind.SUCCEEDED, gateway="evil")
-    plane.session.put(plane.keys.run("t-1", "s1"), encode(event))
-    plane.session.put(plane.keys.run("t-1", "s2"), encode(replace(event, gateway="gw-1")))
+    plane.session.publish(keyspace.RUN_EVENT, event, "t-1", "s1")
+    plane.session.publish(keyspace.RUN_EVENT, replace(event, gateway="gw-1"), "t-1", "s2")
     assert plane.session.refused == {"forged run event": 2}
-    plane.session.put(plane.keys.run("t-2", "s1"), encode(replace(event, gateway="gw-1")))
-    plane.session.put(plane.keys.run("t-2", "s1"), b"{")
+    plane.session.publish(keyspace.RUN_EVENT, replace(event, gateway="gw-1"), "t-2", "s1")
+    plane.session.put(plane.keys(keyspace.RUN_EVENT, "t-2", "s1"), b"{")
     assert plane.session.refused == {"forged run event": 2}
 
 
@@ -323,7 +320,15 @@ async def test_a_plan_that_a_robot_hands_in_waits_where_the_policy_says_so(manag
     policy = SafetyConfig(confirm_skills=("push",))
     catalogue = load_catalogue()
     decomposer = Decomposer(LlmConfig(tiers=("rules",)), catalogue, safety=policy)
-    plans = Plans(TasksConfig(), plane, catalogue=catalogue, decomposer=decomposer, site=Site(), task=manager.task)
+    plans = Plans(
+        TasksConfig(),
+        plane,
+        catalogue=catalogue,
+        decomposer=decomposer,
+        site=Site(),
+        task=manager.questions.task,
+        busy=tuple,
+    )
     plane.registry.robots["rover_1"] = RobotInfo(id="rover_1", kind="zenoh")
     plan = plane.plan_of(Subtask(id="s1", skill="push", robot="rover_1"))
     record = plane.accepted(plan=plan)
@@ -351,16 +356,16 @@ async def test_fields_of_a_newer_version_stay_whatever_is_done_with_a_task(manag
         manager._sweep.set()
 
     put(plane.accepted(plan=plane.plan_of()))
-    await until(lambda: "t-1" in manager._drivers and manager._drivers["t-1"].record.state is TaskState.RUNNING)
-    await manager.cancel(CancelTaskAsk(id="t-1"))
+    await until(lambda: state_of(manager) is TaskState.RUNNING)
+    await manager.questions.cancel(CancelTaskAsk(id="t-1"))
     await until(lambda: manager.unfinished == 0)
     ended = read_record(plane.dht.records["task/t-1"].value)
     assert (ended.state, later("t-1")[0]) == (TaskState.CANCELLED, 1)
     put(ended)
     await plane.rpc.registered["retry"](RetryAsk(id="t-1", by="ann", act="r"))
     assert later("t-1") == [1, 2]
-    await until(lambda: "t-1" in manager._drivers and manager._drivers["t-1"].record.state is TaskState.RUNNING)
-    await manager.cancel(CancelTaskAsk(id="t-1"))
+    await until(lambda: state_of(manager) is TaskState.RUNNING)
+    await manager.questions.cancel(CancelTaskAsk(id="t-1"))
     await until(lambda: manager.unfinished == 0)
     assert later("t-1") == [1, 2]
     lost = LostRun(subtask="s1", attempt=9, gateway="gw-3", state=SubtaskState.RUNNING)
@@ -373,17 +378,19 @@ async def test_fields_of_a_newer_version_stay_whatever_is_done_with_a_task(manag
 async def test_a_cancel_answers_with_the_state_that_came_of_it(manager: TaskManager, plane: Any) -> None:
     """Not with the one before it: as it is written, in the record that others read as well."""
     await manager.submit(wish(plane))
-    await until(lambda: manager._drivers["t-1"].record.subtasks)
-    answer = await manager.cancel(CancelTaskAsk(id="t-1", by="ann", why="enough"))
+    await until(lambda: manager._coordinators["t-1"].record.subtasks)
+    answer = await manager.questions.cancel(CancelTaskAsk(id="t-1", by="ann", why="enough"))
     assert answer.state is TaskState.CANCELLED
     assert read_record(plane.dht.records["task/t-1"].value).state is TaskState.CANCELLED
-    assert (await manager.cancel(CancelTaskAsk(id="t-1"))).cancelled_by == answer.cancelled_by, "asked again: the same"
+    assert (await manager.questions.cancel(CancelTaskAsk(id="t-1"))).cancelled_by == answer.cancelled_by, (
+        "asked again: the same"
+    )
 
 
 async def waiting(manager: TaskManager, plane: Any) -> Record:
     """Have a task wait for approval of its plan; returns its record as it is stored."""
     await manager.submit(replace(wish(plane), approval=Approval.ALWAYS))
-    await until(lambda: "t-1" in manager._drivers and manager._drivers["t-1"].told.state is TaskState.PROPOSED)
+    await until(lambda: state_of(manager, written=True) is TaskState.PROPOSED)
     return plane.dht.records["task/t-1"]
 
 
@@ -397,7 +404,7 @@ async def test_a_coordinator_follows_the_record_that_changes_under_it(
     told = len(plane.session.puts)
     plane.dht.change(Record(key=stored.key, value=encode(other), version={**stored.version, "gw-2": 5}))
     await asyncio.sleep(0)
-    assert (await manager.task(TaskAsk(id="t-1"))).state is state
+    assert (await manager.questions.task(TaskAsk(id="t-1"))).state is state
     await until(lambda: manager.unfinished == 0 and len(plane.session.puts) > told)
     published = [msgspec.json.decode(value, type=TaskRecord) for _, value in plane.session.puts[told:]]
     assert [each.state for each in published] == [state]
@@ -407,7 +414,7 @@ async def test_a_coordinator_follows_the_record_that_changes_under_it(
 async def test_a_task_that_goes_on_under_its_coordinator_is_driven_from_there(manager: TaskManager, plane: Any) -> None:
     """An approval of the other side stands: the coordinator goes on from it instead of waiting for another."""
     stored = await waiting(manager, plane)
-    before = manager._drivers["t-1"]
+    before = manager._coordinators["t-1"]
     record = read_record(stored.value)
     assert record.proposal is not None
     approved = Transition(
@@ -417,22 +424,22 @@ async def test_a_task_that_goes_on_under_its_coordinator_is_driven_from_there(ma
     plane.dht.change(
         Record(key=stored.key, value=encode(machine.apply(record, approved)), version={**stored.version, "gw-2": 1})
     )
-    await until(lambda: "t-1" in manager._drivers and manager._drivers["t-1"] is not before)
-    await until(lambda: manager._drivers["t-1"].told.coordinator == "gw-1")
-    assert manager._drivers["t-1"].told.state is TaskState.RUNNING
+    await until(lambda: "t-1" in manager._coordinators and manager._coordinators["t-1"] is not before)
+    await until(lambda: manager._coordinators["t-1"].written.coordinator == "gw-1")
+    assert manager._coordinators["t-1"].written.state is TaskState.RUNNING
     assert plane.dht.records["task/t-1"].version["gw-2"] == 1, "the approval's write is in what was written since"
 
 
 async def test_a_cancel_goes_to_the_driver_that_follows_one_that_steps_down(manager: TaskManager, plane: Any) -> None:
-    """The record changes under a driver that was just told to cancel: the next one is told, and the answer is true."""
+    """The record changes under a driver that was just told to cancel: the next one gets it, and the answer is true."""
     stored = await waiting(manager, plane)
-    before = manager._drivers["t-1"]
-    cancel = asyncio.create_task(manager.cancel(CancelTaskAsk(id="t-1", by="ann")))
+    before = manager._coordinators["t-1"]
+    cancel = asyncio.create_task(manager.questions.cancel(CancelTaskAsk(id="t-1", by="ann")))
     other = replace(read_record(stored.value), coordinator="gw-2", sequence=9)
     plane.dht.change(Record(key=stored.key, value=encode(other), version={**stored.version, "gw-2": 1}))
     answer = await cancel
     assert answer.state is TaskState.CANCELLED
-    assert manager._drivers.get("t-1") is not before
+    assert manager._coordinators.get("t-1") is not before
     assert read_record(plane.dht.records["task/t-1"].value).state is TaskState.CANCELLED
 
 
@@ -442,7 +449,7 @@ async def test_a_driver_of_a_key_that_is_anothers_answers_for_nobody(manager: Ta
     plane.dht.mine = False
     other = replace(read_record(stored.value), state=TaskState.CANCELLED, coordinator="gw-2")
     plane.dht.records[stored.key] = Record(key=stored.key, value=encode(other), version={"gw-2": 9})
-    assert (await manager.task(TaskAsk(id="t-1"))).state is TaskState.CANCELLED
+    assert (await manager.questions.task(TaskAsk(id="t-1"))).state is TaskState.CANCELLED
 
 
 async def test_an_id_whose_record_was_trimmed_is_not_done_again(manager: TaskManager, plane: Any) -> None:
@@ -452,8 +459,8 @@ async def test_an_id_whose_record_was_trimmed_is_not_done_again(manager: TaskMan
     plane.dht.records["task/t-1"] = Record(key="task/t-1", value=encode(small), version={"gw-2": 1})
     for door in (manager.submit, manager.accept):
         assert await door(wish(plane)) == small
-    assert "details are in the log recorder-1.mcap" in (await manager.why(WhyAsk(id="t-1"))).done
-    assert (await manager.tasks(TasksAsk(limit=10, local=True))).tasks == ()
+    assert "details are in the log recorder-1.mcap" in (await manager.questions.why(WhyAsk(id="t-1"))).done
+    assert (await manager.questions.tasks(TasksAsk(limit=10, local=True))).tasks == ()
     await until(lambda: not manager._sweep.is_set())
     assert manager.unfinished == 0
     assert plane.dht.records["task/t-1"].version == {"gw-2": 1}

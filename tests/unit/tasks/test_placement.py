@@ -74,7 +74,7 @@ def test_what_was_said_long_ago_counts_less() -> None:
 
 
 def test_work_goes_to_its_robots_link_and_to_its_data() -> None:
-    """Without input files the robot's gateway is near; with them, whoever holds them."""
+    """Without input files the robot's gateway is near; with them, the gateway that holds them."""
     gateways = [status("gw-1"), status("gw-2"), status("gw-3")]
     robot = RobotInfo(id="drone_1", kind="mavlink", gateway="gw-2")
     assert order(gateways, robot=robot)[0] == "gw-2"

@@ -1,4 +1,4 @@
-"""Planning anew on the real decomposer's checks: the safety policy holds for what takes a failed subtask's place."""
+"""Replanning by the real decomposer's checks: the safety policy holds for what takes a failed subtask's place."""
 
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,11 +10,11 @@ from appliance.errors import PlanError
 from appliance.llm.cascade import Decomposer
 from appliance.llm.settings import LlmConfig, PlanContext, RobotLimits, SafetyConfig
 from appliance.model import Failure, Plan, RobotInfo, Site, Subtask, TaskRecord
+from appliance.model.transitions import Transition, TransitionKind
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import machine
-from appliance.tasks.durations import Durations
-from appliance.tasks.plans import Recovery
-from appliance.tasks.transition import Transition, TransitionKind
+from appliance.tasks.plans import Plans
+from appliance.tasks.settings import TasksConfig
 
 pytestmark = pytest.mark.anyio
 
@@ -23,15 +23,16 @@ ROBOTS = {name: RobotInfo(id=name, kind="zenoh", uses=("base", "camera"), verbs=
 PHOTO = Subtask(id="s1", skill="photograph", robot="any", params={"target": "shelf"})
 
 
-def recovery(safety: SafetyConfig) -> Recovery:
+def recovery(safety: SafetyConfig) -> Plans:
     """Return it with two robots and a decomposer of this policy."""
     catalogue = load_catalogue()
-    return Recovery(
+    return Plans(
+        TasksConfig(),
         cast("Any", SimpleNamespace(registry=SimpleNamespace(robots=ROBOTS))),
         catalogue=catalogue,
         decomposer=Decomposer(LlmConfig(tiers=("rules",)), catalogue, safety=safety),
         site=Site(),
-        durations=cast("Durations", None),
+        task=cast("Any", None),
         busy=tuple,
     )
 
@@ -60,7 +61,7 @@ def running(submitter: str = "") -> TaskRecord:
     ],
 )
 def test_another_robot_is_held_to_the_policy(safety: SafetyConfig, submitter: str, allowed: bool) -> None:
-    """Whoever takes over may do what is left, and a robot's own task commands no other robot."""
+    """The robot that takes over may do what is left, and a robot's own task commands no other robot."""
     record = failed(running(submitter))
     assert record.plan is not None
     assert (recovery(safety).against(record, record.of("s1"), record.plan, "r2") == ()) is allowed
@@ -81,7 +82,7 @@ def test_another_skill_is_held_to_the_policy() -> None:
 
 
 async def test_a_robots_task_is_planned_anew_as_a_robots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The decomposer is told who asked: with `own` a new plan commands no other robot either."""
+    """The decomposer knows who asked: with `own` a new plan commands no other robot either."""
     asked: list[PlanContext] = []
 
     async def keep(self: Decomposer, record: TaskRecord, context: PlanContext, **_: Any) -> None:

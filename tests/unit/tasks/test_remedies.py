@@ -3,8 +3,7 @@
 import ast
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,10 +11,10 @@ from hypothesis import strategies as st
 
 import appliance
 from appliance.errors import NotFoundError, PlanError, RefusedError, SwiftbotError
-from appliance.model import Failure, RunEventKind, TaskRecord, TaskState
+from appliance.model import Failure, RunEventKind, TaskState
 from appliance.pool.runner.child import REASONS
 from appliance.tasks.machine import TransitionKind
-from appliance.tasks.record_writer import BY_CODE, Keeper, remedied
+from appliance.tasks.record_writer import BY_CODE, Draft, remedied
 from tests.unit.tasks.sample_records import accepted, plan_of
 
 pytestmark = pytest.mark.anyio
@@ -65,17 +64,12 @@ def test_each_code_of_a_failure_has_a_remedy() -> None:
     assert all(text.strip() for text in BY_CODE.values())
 
 
-def test_only_the_keeper_makes_transitions_of_an_accepted_task() -> None:
+def test_only_the_draft_makes_transitions_of_an_accepted_task() -> None:
     """It adds the remedies: a transition that another module makes would go past it."""
     made = {file.relative_to(ROOT).as_posix() for file, _ in calls("Transition")}
     assert made <= {"tasks/record_writer.py", "tasks/manager.py"}, (
         "the manager makes the first one, which holds no failure"
     )
-
-
-def keeper_of(record: TaskRecord) -> Keeper:
-    """Return a keeper of a record on a plane that nothing is written to."""
-    return Keeper(cast("Any", SimpleNamespace(gateway="gw-1")), record, {}, lambda _: None)
 
 
 FAILURES = st.builds(
@@ -90,20 +84,16 @@ FAILURES = st.builds(
 @given(FAILURES)
 def test_whatever_failed_the_record_says_what_to_do(failure: Failure) -> None:
     """A failure of planning, of an attempt or of the coordinator gets a remedy, whatever its code, or keeps its own."""
-    unplanned = keeper_of(accepted())
-    unplanned.apply(unplanned.transition(TransitionKind.PLAN_FAILED, failure=failure))
-    running = keeper_of(accepted())
-    running.apply(running.transition(TransitionKind.PLANNED, plan=plan_of()))
-    running.apply(
-        running.transition(
-            TransitionKind.ATTEMPT_FAILED, subtask="s1", attempt=1, failure=failure, give_up=True, replan=False
-        )
-    )
-    given_up = keeper_of(accepted())
-    given_up.apply(given_up.transition(TransitionKind.PLANNED, plan=plan_of()))
-    given_up.apply(given_up.transition(TransitionKind.CANCEL, failure=failure))
-    for keeper in (unplanned, running, given_up):
-        ended = keeper.record
+    unplanned = Draft(accepted(), "gw-1")
+    unplanned.apply(TransitionKind.PLAN_FAILED, failure=failure)
+    running = Draft(accepted(), "gw-1")
+    running.apply(TransitionKind.PLANNED, plan=plan_of())
+    running.apply(TransitionKind.ATTEMPT_FAILED, subtask="s1", attempt=1, failure=failure, give_up=True, replan=False)
+    given_up = Draft(accepted(), "gw-1")
+    given_up.apply(TransitionKind.PLANNED, plan=plan_of())
+    given_up.apply(TransitionKind.CANCEL, failure=failure)
+    for draft in (unplanned, running, given_up):
+        ended = draft.record
         assert ended.state is TaskState.FAILED
         assert ended.failure is not None
         assert ended.failure.remedy.strip()
@@ -125,7 +115,7 @@ def test_a_remedy_names_the_task_in_its_commands() -> None:
 )
 async def test_a_plan_that_fails_has_a_remedy(bench: Any, error: Exception) -> None:
     """Whatever the planner raises, also an error without a remedy."""
-    bench.around.the_plan = error
+    bench.context.the_plan = error
     await bench.start()
     ended = await bench.end()
     assert ended.state is TaskState.FAILED

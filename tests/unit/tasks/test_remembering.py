@@ -1,4 +1,4 @@
-"""Ids of finished tasks: what is remembered of them, for how long, and what whoever uses one again is answered."""
+"""Ids of finished tasks: what is remembered of them, for how long, and the answer to a request that uses one again."""
 
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,12 @@ from msgspec.structs import replace
 
 from appliance.errors import RefusedError
 from appliance.model import Failure, Plan, Split, Subtask, SubtaskRecord, TaskRecord, TaskRequest, TaskState, encode
-from appliance.plane.records import Record
+from appliance.model.plane_api import Record
+from appliance.model.task_api import RetryAsk
 from appliance.plane.store import Store
-from appliance.tasks.api import RetryAsk
 from appliance.tasks.conflicts import merged, stronger
-from appliance.tasks.retention import TRIMMED, Kept, answered, done_text, due, may_trim, trimmed
+from appliance.tasks.records import answered, done_text, may_trim, trimmed
+from appliance.tasks.retention import TRIMMED, Kept, due
 from appliance.tasks.steering import may_retry
 from appliance.tasks.views import why
 
@@ -140,7 +141,7 @@ def test_an_id_used_again_is_answered_with_what_came_of_it() -> None:
 
 
 def test_nothing_of_a_trimmed_task_can_be_tried_again() -> None:
-    """There is no plan left of a task that failed: it has to be submitted anew."""
+    """There is no plan left of a task that failed: it has to be submitted again."""
     small = trimmed(done(state=TaskState.FAILED), "log.mcap")
     with pytest.raises(RefusedError, match=r"done on .* its plan is not kept"):
         may_retry(small, RetryAsk(id="t-1", by="ann", act="o-1"))

@@ -6,15 +6,10 @@ from typing import Any
 import pytest
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, VolumeInfo
-from appliance.tasks.api import ContainerList
-from appliance.tasks.offload import (
-    BRING_MS,
-    EMPTY_OFFERS,
-    FIRST_LEFT_OUT_S,
-    LEFT_OUT_S,
-    RemoteContainers,
-    UnmeasuredLinks,
-)
+from appliance.model.task_api import ContainerList
+from appliance.plane.events import Lost
+from appliance.pool.selection import UNMEASURED
+from appliance.tasks.offload import EMPTY_OFFERS, FIRST_LEFT_OUT_S, LEFT_OUT_S, RemoteContainers
 
 pytestmark = pytest.mark.anyio
 
@@ -32,7 +27,7 @@ def remote(plane: Any, monkeypatch: pytest.MonkeyPatch) -> RemoteContainers:
     """Return what gw-1 knows of gw-2, gw-3 (asked) and gw-4 (heard of)."""
     monkeypatch.setattr("appliance.tasks.offload.PROMISED_S", 3600.0)  # or a slow machine is too late to see a promise
     plane.present = {"gw-1", "gw-2", "gw-3", "gw-4"}
-    return RemoteContainers(plane, successors=3, links=UnmeasuredLinks())
+    return RemoteContainers(plane, successors=3)
 
 
 def know(plane: Any, *containers: ContainerInfo) -> None:
@@ -98,26 +93,23 @@ async def test_state_is_where_its_newest_generation_is(remote: RemoteContainers,
     facts = remote.facts(NEED)
     assert set(facts.volumes) == {"maps"}
     assert [each.gateway for each in facts.volumes["maps"]] == ["gw-2", "gw-3"]
-    # 12.5 MB at a guess of 12.5 MB/s, and 200 MB/s to pack and to unpack.
-    assert facts.files_ms(12_500_000, "gw-2") == pytest.approx(1000)
-    assert facts.state_ms(12_500_000, "gw-2") == pytest.approx(BRING_MS + 5 + 1000 + 2 * 62.5)
+    assert facts.link("gw-2") == UNMEASURED
 
 
 async def test_empty_offers_leave_a_gateway_out_for_a_while(remote: RemoteContainers, plane: Any) -> None:
     """The clock is passed in; a good offer, and the gateway's going, end it."""
     now = 100.0
     for _ in range(EMPTY_OFFERS - 1):
-        remote.turned_out(remote.promise("gw-2"), good=False, now=lambda: now)
+        remote.outcome(remote.promise("gw-2"), taken=False, now=lambda: now)
     assert remote.left_out(lambda: now) == {}
-    remote.turned_out(remote.promise("gw-2"), good=False, now=lambda: now)
+    remote.outcome(remote.promise("gw-2"), taken=False, now=lambda: now)
     assert set(remote.left_out(lambda: now)) == {"gw-2"}
     assert remote.left_out(lambda: now + FIRST_LEFT_OUT_S) == {}
     for _ in range(20):  # one that goes on offering nothing is left out for longer and longer, up to a bound
-        remote.turned_out(remote.promise("gw-2"), good=False, now=lambda: now)
+        remote.outcome(remote.promise("gw-2"), taken=False, now=lambda: now)
     assert set(remote.left_out(lambda: now + LEFT_OUT_S - 0.1)) == {"gw-2"}
     assert remote.left_out(lambda: now + LEFT_OUT_S) == {}
-    for callback in plane.on_member_lost:
-        callback("gw-2")
+    plane.events.publish(Lost("gw-2"))
     assert remote.left_out(lambda: now) == {}
 
 
@@ -146,7 +138,7 @@ async def test_a_container_that_a_run_was_just_sent_to_is_not_offered_to_the_nex
     sent = remote.promise("gw-2")
     assert {each.id for each in remote.ready(NEED)} == {"b"}
     assert await found(remote) == {"b": READY}
-    remote.turned_out(sent, good=False)
+    remote.outcome(sent, taken=False)
     assert remote.ready(NEED) == []
     assert set(await found(remote)) == {"b"}
     assert [gateway for gateway, _, _ in plane.rpc.calls] == ["gw-2"]
@@ -187,26 +179,26 @@ async def test_short_runs_one_after_the_other_find_the_same_container(remote: Re
 
 
 async def test_a_run_holds_its_container_until_that_one_is_told_of(remote: RemoteContainers, plane: Any) -> None:
-    """Once it is known which one a run got, the others are counted on, and it too as soon as it is told of anew."""
+    """Once it is known which one a run got, the others are counted on, and it too as soon as it is heard of again."""
     know(plane, container("gw-2", "a", runs=3), container("gw-2", "b"))
     plane.registry.ages = {"gw-2": 0.1}
     sent = remote.promise("gw-2")
     assert {each.id for each in remote.ready(NEED)} == {"b"}
-    remote.turned_out(sent, good=True, container="b")
+    remote.outcome(sent, taken=True, container="b")
     assert {each.id for each in remote.ready(NEED)} == {"a"}
     know(plane, container("gw-2", "b", BUSY))
-    remote.turned_out(remote.promise("gw-2"), good=True, container="a")
+    remote.outcome(remote.promise("gw-2"), taken=True, container="a")
     assert remote.ready(NEED) == []
     know(plane, container("gw-2", "a", runs=4))  # so short that it was never told to be busy
     assert {each.id for each in remote.ready(NEED)} == {"a"}
 
 
 async def test_a_run_that_was_heard_to_end_holds_nothing(remote: RemoteContainers, plane: Any) -> None:
-    """Its container is ready again long before it is told of, unless others wait there; only whoever has it ends it."""
+    """Its container is ready long before its gateway says so, unless others wait there; only its gateway ends it."""
     know(plane, container("gw-2", "a"))
     plane.registry.ages = {"gw-2": 0.1}
     run = ("t1", "s1")
-    remote.turned_out(remote.promise("gw-2", run), good=True, container="a")
+    remote.outcome(remote.promise("gw-2", run), taken=True, container="a")
     assert remote.waits_for(run)
     remote.over(run, "gw-3")
     remote.over(("t1", "s2"), "gw-2")
@@ -241,8 +233,8 @@ async def test_the_next_attempt_is_waited_for_when_the_one_before_is_given_up(
     plane.registry.ages = {"gw-2": 0.1, "gw-3": 0.1}
     run = ("t1", "s1")
     first = remote.promise("gw-2", run)
-    remote.turned_out(remote.promise("gw-3", run), good=True, container="b")
-    remote.turned_out(first, good=False)
+    remote.outcome(remote.promise("gw-3", run), taken=True, container="b")
+    remote.outcome(first, taken=False)
     remote._forget("gw-2")
     assert remote.waits_for(run)
     remote.over(run, "gw-3")
@@ -254,7 +246,7 @@ async def test_an_offer_that_came_to_nothing_holds_no_container(remote: RemoteCo
     """A run that was refused has none: when its gateway is believed again, all that are ready there count."""
     know(plane, container("gw-2", "a"))
     plane.registry.ages = {"gw-2": 0.1}
-    remote.turned_out(remote.promise("gw-2"), good=False)
+    remote.outcome(remote.promise("gw-2"), taken=False)
     assert not remote._open("gw-2")
 
 
@@ -268,11 +260,11 @@ async def test_an_answer_that_took_long_is_not_taken_for_another_runs(
     slow = [remote.promise("gw-2"), remote.promise("gw-2")]
     monkeypatch.setattr("appliance.tasks.offload.PROMISED_S", 3600.0)
     later = remote.promise("gw-2")
-    remote.turned_out(slow[0], good=True, container="c")
+    remote.outcome(slow[0], taken=True, container="c")
     assert {each.id for each in remote.ready(NEED)} == {"b", "c"}, "whose answer is still to come holds one"
-    remote.turned_out(slow[1], good=False)
+    remote.outcome(slow[1], taken=False)
     assert remote._open("gw-2") == [later]
-    remote.turned_out(later, good=True, container="a")
+    remote.outcome(later, taken=True, container="a")
     remote._doubted.clear()
     assert {each.id for each in remote.ready(NEED)} == {"b", "c"}
 

@@ -75,7 +75,7 @@ def test_a_missing_transition_is_named(tmp_path: Path) -> None:
 
 
 def test_another_end_state_is_named(tmp_path: Path) -> None:
-    """A record that its transitions do not give is told with both states."""
+    """A record that its transitions do not give is reported with both states."""
     transitions, record = history(*STEPS)
     wrong = msgspec.structs.replace(record, state=TaskState.FAILED, failure=Failure(code="x", message="x"))
     report = replay(write(tmp_path / "a.mcap", transitions, wrong))

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.errors import RefusedError
-from appliance.model import Failure, RunEvent, RunEventKind, SubtaskState, TaskState, encode
-from appliance.tasks.api import DrainAsk, RunStatus
+from appliance.model import Failure, RunEvent, RunEventKind, SubtaskState, TaskState, keyspace
+from appliance.model.task_api import DrainAsk, RunStatus
 from appliance.tasks.conflicts import foreign, heal
-from appliance.tasks.context import CancelAsked, GatewayLost
+from appliance.tasks.events import CancelAsked, GatewayLost
 from appliance.tasks.executor import Executor
 from appliance.tasks.machine import StaleTransitionError, Transition, TransitionKind, apply, gives_up
 from tests.unit.tasks import test_executor
@@ -76,7 +76,7 @@ async def test_a_run_of_a_task_that_has_ended_elsewhere_is_ended(executor: Execu
     """A gateway that was cut off ends what nobody waits for any more (hashicorp/nomad#2185)."""
     await executor.run(REQUEST)
     await until(lambda: pool.runs)
-    plane.session.put(plane.keys.task("t-1"), encode(replace(plane.accepted(), state=TaskState.CANCELLED)))
+    plane.session.publish(keyspace.TASK_UPDATE, replace(plane.accepted(), state=TaskState.CANCELLED), "t-1")
     await until(lambda: pool.cancelled)
     assert pool.cancelled == ["t-1/s1/1"]
     await finish(pool)

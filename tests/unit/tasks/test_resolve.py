@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from appliance.model import Attempt, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState, encode
 from appliance.plane.dht import Record
-from appliance.pool.lineage import VolumeRecord
+from appliance.pool.volumes.lineage import VolumeRecord
 from appliance.tasks.conflicts import MOST_SPLITS, merged, resolver, stronger
 
 

@@ -1,5 +1,8 @@
 """Forgetting old tasks: the newest stay, effects go only with their task."""
 
+import asyncio
+import time
+from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 from unittest.mock import ANY
@@ -8,10 +11,12 @@ import msgspec
 import pytest
 from structlog.testing import capture_logs
 
-from appliance.errors import UnreachableError
+from appliance.errors import PrerequisiteError, RefusedError, UnreachableError
 from appliance.model import Remembered, TaskRecord, TaskState
 from appliance.plane.dht import Record
 from appliance.plane.node import Plane
+from appliance.tasks import retention as retention_module
+from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.retention import AT_ONCE, Retention
 from appliance.tasks.settings import TasksConfig
 
@@ -44,7 +49,7 @@ class Records:
     async def read(self, key: str) -> Record | None:
         """One record."""
         if "away" in key:
-            raise UnreachableError("whoever may have it did not answer")
+            raise UnreachableError("the gateway that may have it did not answer")
         return self.kept.get(key)
 
     async def write(self, key: str, value: bytes, *, expected: dict[str, int]) -> dict[str, int]:
@@ -89,8 +94,48 @@ async def test_checkpoints_of_ended_tasks_are_forgotten() -> None:
     assert [key for key in records.kept if key.startswith("checkpoint/")] == ["checkpoint/runs/s1"]
 
 
+async def test_what_belongs_to_a_running_task_stays_whatever_the_rest_of_its_key() -> None:
+    """A newer version may write keys of more names: they go with their task all the same."""
+    records = Records()
+    for task in ("runs", "gone"):
+        records.put(f"effect/{task}/s1/1/part")
+        records.put(f"ask/{task}")
+    records.task("runs", TaskState.RUNNING, 0)
+    assert await Retention(cast("Plane", SimpleNamespace(dht=records)), TasksConfig()).round() == 2
+    assert sorted(records.kept) == ["ask/runs", "effect/runs/s1/1/part", "task/runs"]
+
+
+class Store:
+    """A gateway's store on a disk that cannot be read."""
+
+    async def get(self, key: str) -> bytes:
+        """Fail."""
+        raise PrerequisiteError(f"{key}: the disk fails")
+
+    async def put(self, key: str, value: bytes, *, durable: bool) -> None:
+        """Keep nothing."""
+
+
+async def test_nothing_that_a_round_meets_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It runs as a root task: its end would be the gateway's, and that of the record's next owner."""
+    session = SimpleNamespace(subscribe_typed=lambda *_: None)
+    plane = cast("Plane", SimpleNamespace(dht=Records(), store=Store(), session=session))
+    retention, rounds = Retention(plane, TasksConfig(retention_s=0.01)), list[int]()
+
+    async def round_() -> int:
+        rounds.append(len(rounds))
+        raise (ValueError if len(rounds) % 2 else RefusedError)("a record like no other")
+
+    monkeypatch.setattr(retention, "round", round_)
+    running = asyncio.create_task(retention.run())
+    while len(rounds) < 4 and not running.done():
+        await asyncio.sleep(0.01)
+    assert not running.done()
+    running.cancel()
+
+
 async def test_what_belongs_to_a_task_that_cannot_be_looked_up_stays() -> None:
-    """Whoever has its record may only be away; what belongs to others is forgotten all the same."""
+    """The owner of its record may only be away; what belongs to others is forgotten all the same."""
     records = Records()
     for task in ("away", "gone"):
         records.put(f"effect/{task}/s1/1")
@@ -101,7 +146,7 @@ async def test_what_belongs_to_a_task_that_cannot_be_looked_up_stays() -> None:
 
 
 async def test_many_tasks_that_are_kept_do_not_hide_what_is_left_over_behind_them() -> None:
-    """More than a round looks up: the next goes on from there, and then begins anew."""
+    """More than a round looks up: the next goes on from there, and then begins again."""
     records = Records()
     for number in range(AT_ONCE + 10):
         records.task(f"a{number:04}", TaskState.RUNNING, 0)
@@ -142,3 +187,58 @@ async def test_ids_of_old_tasks_stay_with_their_outcome_and_log(monkeypatch: pyt
     await retention.round()
     assert [key for key in records.kept if key.startswith("task/")] == ["task/t-3"]
     assert retention.forgotten == 1, "those had their time"
+
+
+async def test_files_go_with_their_task(tmp_path: Path) -> None:
+    """Files of tasks that are trimmed are removed, those of others stay, and so does what other records own."""
+    records = Records()
+    records.task("kept", TaskState.RUNNING, 0)
+    trimmed = TaskRecord(
+        id="trimmed", instruction="x", state=TaskState.SUCCEEDED, updated_ns=time.time_ns(), remembered=Remembered()
+    )
+    records.put("task/trimmed", msgspec.json.encode(trimmed))
+    files = Artifacts(tmp_path, gateway="gw-1", max_bytes=100)
+    owners = ["learn/r1", "task/away", "task/gone", "task/kept", "task/trimmed"]
+    for owner in owners:
+        await files.put("a", owner.encode(), "text/plain", owner=owner)
+    await files.put("a", b"shared", "text/plain", owner="task/trimmed")
+    await files.put("a", b"shared", "text/plain", owner="task/kept")
+    retention = Retention(cast("Plane", SimpleNamespace(dht=records)), TasksConfig(), files)
+    await retention.round()
+    assert await files.owners() == ("learn/r1", "task/away", "task/gone", "task/kept")
+    assert len(list(tmp_path.glob("??/*"))) == 5
+
+
+async def test_files_outlast_a_partition(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gateway cut off from all that hold a task's record keeps its files; they go when it is absent for a day."""
+    records, files = Records(), Artifacts(tmp_path, gateway="gw-1", max_bytes=100)
+    await files.put("a", b"picture", "image/png", owner="task/t-1")
+    retention = Retention(cast("Plane", SimpleNamespace(dht=records)), TasksConfig(), files)
+    await retention.round()
+    records.task("t-1", TaskState.RUNNING, 0)
+    await retention.round()
+    monkeypatch.setattr(retention_module, "ABSENT_S", 0.05)
+    del records.kept["task/t-1"]
+    await retention.round()
+    assert await files.owners() == ("task/t-1",)
+    await asyncio.sleep(0.1)
+    await retention.round()
+    assert await files.owners() == ()
+
+
+async def test_all_owners_of_files_have_their_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more owners than a round looks up, the next round goes on behind them, and then begins again."""
+    monkeypatch.setattr(retention_module, "AT_ONCE", 2)
+    monkeypatch.setattr(retention_module, "ABSENT_S", 0.0)
+    records, files = Records(), Artifacts(tmp_path, gateway="gw-1", max_bytes=100)
+    for number in range(5):
+        await files.put("a", b"%d" % number, "text/plain", owner=f"task/{number}")
+        if number < 4:
+            records.task(str(number), TaskState.RUNNING, 0)
+    retention = Retention(cast("Plane", SimpleNamespace(dht=records)), TasksConfig(), files)
+    for _ in range(3):
+        await retention.round()
+    assert await files.owners() == ("task/0", "task/1", "task/2", "task/3")
+    del records.kept["task/0"]
+    await retention.round()
+    assert await files.owners() == ("task/1", "task/2", "task/3")

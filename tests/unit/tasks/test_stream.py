@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.model import Failure, LogLine, Notice, Phase, RunEvent, RunEventKind
-from appliance.tasks.api import TaskLinesAsk
-from appliance.tasks.lines import Line, LineKind, of_event, of_log, of_notice, of_transition
+from appliance.model.task_api import Line, LineKind, TaskLinesAsk
+from appliance.model.transitions import Transition, TransitionKind
+from appliance.tasks.lines import of_event, of_log, of_notice, of_transition
 from appliance.tasks.stream import Kept, Merge
-from appliance.tasks.transition import Transition, TransitionKind
 
 SECOND = 1_000_000_000
 
@@ -171,7 +171,7 @@ def test_whatever_comes_when_each_source_keeps_its_order_and_nothing_is_lost(
 
 @pytest.mark.anyio
 async def test_a_gateway_keeps_the_last_lines_of_each_task_within_one_bound() -> None:
-    """The oldest lines of a task go first, then the task not heard of for longest; how many is told."""
+    """The oldest lines of a task go first, then the task not heard of for longest; how many is shown."""
     kept = Kept("gw-1", per_task=5, altogether=12)
     for number in range(1, 9):
         kept.hear_event(replace(event(RunEventKind.LOG, note=str(number)), number=number))

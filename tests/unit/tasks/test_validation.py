@@ -1,4 +1,4 @@
-"""Records from elsewhere: unsound ones are told from sound ones."""
+"""Records from elsewhere: unsound ones are distinguished from sound ones."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def record(*subtasks: tuple[str, tuple[str, ...]], **params: Any) -> TaskRecord:
 
 @pytest.mark.thorough
 def test_what_cannot_end_is_unsound() -> None:
-    """Cycles, what comes after nothing, two of one name, far too many and far too deep: each is told."""
+    """Cycles, what comes after nothing, two of one name, far too many and far too deep: each is reported."""
     deep: Any = {}
     for _ in range(200):
         deep = {"x": deep}
@@ -53,7 +53,7 @@ def test_plans_in_order_are_sound(after: list[set[int]]) -> None:
 
 
 def test_what_comes_after_megabytes_of_others_is_looked_at_once() -> None:
-    """A chain as long as can be, each after all before it many times over, is told sound, or not, without a pause."""
+    """A chain as long as can be, each after all before it many times over, is found sound, or not, without a pause."""
     names = [f"s{number}" for number in range(MOST_SUBTASKS)]
     chain = [(name, tuple(names[:place]) * 20) for place, name in enumerate(names)]
     assert unsound(record(*chain)) is None

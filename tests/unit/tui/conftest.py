@@ -1,4 +1,5 @@
 """A small fleet and a view of it that needs no network: the fake at the terminal UI's one seam."""
+# pyright: reportPrivateUsage=false
 
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
 from typing import cast
@@ -29,9 +30,9 @@ from appliance.model import (
     TaskState,
     Tier,
 )
-from appliance.tasks.api import PlanAnswer
-from appliance.tasks.lines import Line
-from appliance.tasks.views import TaskWhy, why
+from appliance.model.roles import Role
+from appliance.model.task_api import Line, PlanAnswer, TaskWhy
+from appliance.tasks.views import why
 from appliance.tui.store import Connection, Store
 
 PLAN = Plan(
@@ -222,7 +223,9 @@ class FakeView:
 
     fleet = "test"
     operator = "ops"
+    role: Role | None = None
     steerable = True
+    moment = ""
 
     def __init__(self) -> None:
         self.store = Store(tasks=50, entries=100)

@@ -1,6 +1,6 @@
 """Snapshots of screens as text: the characters, and below them for each theme which style stands where.
 
-They are compared with files in `snapshots/`; `SWIFTBOT_RENEW_SNAPSHOTS=1 pytest …` writes the files anew, to be read
+They are compared with files in `snapshots/`; `SWIFTBOT_RENEW_SNAPSHOTS=1 pytest …` writes the files again, to be read
 before they are committed.
 """
 
@@ -72,12 +72,12 @@ def _words(style: Style | None) -> str:
 
 
 def compare(name: str, picture: str) -> None:
-    """Compare a picture with its file, or write the file anew when that is asked for."""
+    """Compare a picture with its file, or write the file again when that is asked for."""
     path = FOLDER / f"{name}.txt"
     if RENEW:
         path.write_text(picture + "\n")
     assert path.exists(), f"{path.name} is missing: write it with SWIFTBOT_RENEW_SNAPSHOTS=1"
-    assert picture + "\n" == path.read_text(), f"{path.name} differs; SWIFTBOT_RENEW_SNAPSHOTS=1 writes it anew"
+    assert picture + "\n" == path.read_text(), f"{path.name} differs; SWIFTBOT_RENEW_SNAPSHOTS=1 writes it again"
 
 
 @contextmanager

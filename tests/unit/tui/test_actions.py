@@ -14,11 +14,10 @@ from msgspec.structs import replace
 
 from appliance.errors import ConfigError, SwiftbotError
 from appliance.model import Enquiry, SoftStop
-from appliance.pool.api import Evicted, Released, Warmed
-from appliance.pool.transfer.protocol import Brought
-from appliance.robots.api import StopAnswer
-from appliance.tasks.api import DrainState, Migrated
-from appliance.tasks.views import TaskWhy
+from appliance.model.pool_api import Evicted, Released, Warmed
+from appliance.model.robot_api import StopAnswer
+from appliance.model.task_api import DrainState, Migrated, TaskWhy
+from appliance.model.transfer_api import Brought
 from appliance.tui import command_line, status_styles
 from appliance.tui.actions import ACTIONS, BY_NAME, SCREENS, keymap
 from appliance.tui.app import SwiftbotApp
@@ -47,10 +46,9 @@ def test_each_action_is_whole() -> None:
     assert len(BY_NAME) == len(ACTIONS)
     for action in ACTIONS:
         assert action.help
-        assert bool(action.call) != (action.do is not None), action.name
+        assert action.call or action.function is not None, action.name
         assert action.writes or not action.dangerous, action.name
-        if action.dangerous and action.do is not None:
-            assert action.confirm, action.name
+        if action.dangerous:
             sentence = action.sentence({each.name: f"<{each.name}>" for each in action.takes})
             assert "{" not in sentence
             assert "?" in sentence
@@ -173,9 +171,9 @@ def test_unknown_states_have_a_sign(state: str) -> None:
 
 DRAINING = DrainState(gateway="gw-a", draining=True, done=False, moved=0, ended=0, left=())
 CASES = [
-    ("1", "d", "drain", ("gw-a", 0.0), DRAINING, "gw-a drains: 0 runs left"),
-    ("1", "u", "undrain", ("gw-a",), DRAINING, "gw-a takes runs again"),
-    ("4", "e", "pool_evict", ("c1", ""), {"gw-a": Evicted(containers=("c1",))}, "gw-a: 1 given up"),
+    ("1", "d", "drain", ("gw-a", 0.0), DRAINING, "gw-a drains: 0 runs moved away, 0 ended there, 0 left"),
+    ("1", "u", "undrain", ("gw-a",), replace(DRAINING, draining=False), "gw-a accepts runs"),
+    ("4", "e", "pool_evict", ("c1", ""), {"gw-a": Evicted(containers=("c1",))}, "gw-a evicted c1"),
     ("3", "x", "stop", (("drone-1",),), StopAnswer(stops=(), robots=("drone-1",)), "holding: drone-1"),
     ("3", "z", "resume_robots", (("drone-1",),), StopAnswer(stops=()), "drone-1 may move again"),
     ("3", "Z", "resume_robots", ((),), StopAnswer(stops=()), "all robots may move again"),
@@ -187,7 +185,7 @@ CASES = [
 async def test_key_does_its_action(
     view: "FakeView", screen: str, key: str, verb: str, arguments: tuple[object, ...], answer: object, told: str
 ) -> None:
-    """A key orders its action of the row under the cursor, after a yes where it is dangerous, and the end is told."""
+    """A key orders its action of the row under the cursor, after a yes where it is dangerous, and its end is shown."""
     view.orders.answers[verb] = answer
     app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE, notifications=True) as pilot:
@@ -253,7 +251,7 @@ async def test_line_does_its_action(view: "FakeView", line: str, verb: str, answ
 
 async def test_another_model_is_asked_about_first(view: "FakeView") -> None:
     """Swapping a gateway's model takes its folder from the line, asks, and tells which model went and came."""
-    view.orders.answers["swap_model"] = SimpleNamespace(before="old", after="new")
+    view.orders.answers["swap_model"] = SimpleNamespace(before="old", after="new", ms=1.0, tests=())
     app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("5")
@@ -405,7 +403,7 @@ async def test_same_order_twice_is_one(view: "FakeView") -> None:
 
 
 async def test_defect_of_an_order_does_not_end_the_ui(view: "FakeView") -> None:
-    """An order that breaks in a way nobody thought of is told, and the UI goes on."""
+    """An order that breaks in a way nobody thought of is reported, and the UI goes on."""
     app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE, notifications=True) as pilot:
         await settle(app, pilot)

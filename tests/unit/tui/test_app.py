@@ -1,4 +1,5 @@
 """The terminal UI under Textual's pilot, 80 columns by 24 lines, on a fake view."""
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportUnknownMemberType=false, reportUnknownArgumentType=false
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,9 +10,10 @@ from msgspec.structs import replace
 
 from appliance.errors import PlanError, RefusedError, UnreachableError
 from appliance.model import LogLine, Notice, RunEvent, RunEventKind, TaskRecord, TaskState, encode
-from appliance.record.models import RecorderStatus
+from appliance.model.recorder_api import RecorderStatus
+from appliance.model.roles import Role
 from appliance.tui.actions import ACTIONS
-from appliance.tui.app import SwiftbotApp, export_picture
+from appliance.tui.app import OperationProvider, SwiftbotApp
 from appliance.tui.screens.submit import SubmitDialog
 from appliance.tui.settings import TuiConfig
 from appliance.tui.store import Connection
@@ -188,7 +190,7 @@ async def test_submit_shows_the_plan_first(view: "FakeView") -> None:
 
 
 async def test_editing_withdraws_the_plan(view: "FakeView") -> None:
-    """A plan that was shown is not run for an instruction edited since: it is planned anew."""
+    """A plan that was shown is not run for an instruction edited since: it is replanned."""
     app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
         await pilot.press("s", *"a", "enter")
@@ -289,6 +291,37 @@ async def test_read_only_changes_nothing(view: "FakeView") -> None:
         assert "[R] read-only" in await settle(app, pilot)
 
 
+async def test_what_the_certificate_does_not_allow_is_locked(view: "FakeView") -> None:
+    """A viewer's: nothing is asked of the fleet, and the role that it needs is said; an operator's lets it through."""
+    view.role = Role.VIEWER
+    app = SwiftbotApp(view, UNLOCKED)
+    async with app.run_test(size=SIZE, notifications=True) as pilot:
+        await pilot.press("colon", *"cancel t-running", "enter")
+        assert "cancel needs the role operator" in await settle(app, pilot)
+        assert not isinstance(app.screen, ConfirmDialog | SubmitDialog)
+        view.role = Role.OPERATOR
+        await pilot.press("colon", *"drain gw-a", "enter")
+        assert "drain needs the role engineer" in await settle(app, pilot)
+        await pilot.press("colon", *"cancel t-running", "enter")
+        await settle(app, pilot)
+        await pilot.press("y")
+        await settle(app, pilot)
+    assert view.orders.of("cancel") == [("t-running",)]
+    assert view.orders.of("drain") == []
+
+
+async def test_a_viewer_may_stop_the_fleet(view: "FakeView") -> None:
+    """By the key and in words: the soft stop is open to every role."""
+    view.role = Role.VIEWER
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE, notifications=True) as pilot:
+        await pilot.press("f8")
+        await settle(app, pilot)
+        await pilot.press("colon", *"submit stop", "enter")
+        await settle(app, pilot)
+    assert len(view.orders.of("stop")) == 2
+
+
 async def test_refusal_is_shown_with_its_remedy(view: "FakeView") -> None:
     """What a gateway refuses is shown with cause and remedy, and the UI goes on."""
     view.orders.error = RefusedError("gateway is draining", remedy="ask another")
@@ -322,7 +355,7 @@ async def test_lost_connection_has_a_banner(view: "FakeView") -> None:
 
 
 async def test_what_is_typed_outlives_the_connection(view: "FakeView") -> None:
-    """An instruction, its plan and a command line stay while the connection is lost and made anew, and go on then."""
+    """An instruction, its plan and a command line stay while the connection is lost and made again, and go on then."""
     lost = Connection(problem="no gateway", remedy="start one")
     app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
@@ -396,7 +429,7 @@ async def test_selection_stays_when_tasks_come(view: "FakeView") -> None:
 async def test_help_lists_every_action(view: "FakeView") -> None:
     """The help shows each action of the one list."""
     app = SwiftbotApp(view)
-    async with app.run_test(size=(120, 140)) as pilot:
+    async with app.run_test(size=(120, 170)) as pilot:
         await pilot.press("question_mark")
         await pilot.pause()
         assert isinstance(app.screen, HelpDialog)
@@ -412,9 +445,11 @@ async def test_palette_offers_every_action(view: "FakeView") -> None:
     """The command palette is fed by the same list, and running an entry does the action."""
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
-        commands = {command.title: command for command in app.get_system_commands(app.screen)}
-        assert {action.title for action in ACTIONS} <= commands.keys()
-        await commands["Pool"].callback()
+        provider = OperationProvider(app.screen)
+        commands = {str(hit.display): hit.command async for hit in provider.discover()}
+        assert {action.title for action in ACTIONS} == commands.keys()
+        assert "Uncordon" in {str(hit.text) async for hit in provider.search("cordon")}
+        commands["Pool"]()
         await pilot.pause()
         assert app.current_mode == "pool"
 
@@ -443,7 +478,11 @@ async def test_markup_in_foreign_text_is_text(view: "FakeView") -> None:
 
 async def test_picture_is_an_svg_of_the_screen(view: "FakeView", tmp_path: Path) -> None:
     """The picture is well-formed SVG with the screen's text and no reference to another machine's fonts."""
-    await export_picture(view, tmp_path / "tui.svg")
+    app = SwiftbotApp(view)
+    async with app.run_test(size=(100, 30)) as pilot:
+        await pilot.press("2")
+        await settle(app, pilot)
+        app.export_svg(tmp_path / "tui.svg")
     text = (tmp_path / "tui.svg").read_text()
     ET.fromstring(text)  # noqa: S314 - our own file
     assert "t-running" in text

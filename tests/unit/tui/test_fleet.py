@@ -19,7 +19,7 @@ from appliance.model import (
     TaskRecord,
     TaskState,
 )
-from appliance.record.models import RecorderStatus
+from appliance.model.recorder_api import RecorderStatus
 from appliance.tui import robot_view as robots
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.screens import fleet, models
@@ -46,11 +46,11 @@ ROOM = 80 - 2 - 1
 @pytest.mark.parametrize(
     ("columns", "needed"),
     [
-        (fleet.GATEWAYS, "gateway state load cpu mem pool runs tasks link arc version"),
+        (fleet.GATEWAYS, "gateway state load cpu mem pool runs tasks link ring version"),
         (tasks_screen.TASKS, "task state done % at by instruction"),
         (robots_screen.ROBOTS, "robot kind, link mode batt x y z mission state"),
-        (fleet.CONTAINERS, "image container gateway state age hits cpu/mem running now"),
-        (models.GATEWAYS, "gateway slot queue tok/s plans escal. share of tiers asked"),
+        (fleet.CONTAINERS, "image container gateway state age runs cpu/mem running now"),
+        (models.GATEWAYS, "gateway slot queue tok/s plans escalated share of tiers asked"),
     ],
     ids=["fleet", "tasks", "robots", "pool", "llm"],
 )
@@ -68,6 +68,7 @@ SICK = [
     GatewayStatus(id="g", fleet="f", draining=True, drain="gives 2 runs away"),
     GatewayStatus(id="g", fleet="f", limits_enforced=False),
     GatewayStatus(id="g", fleet="f", site_problem="site yard has no fence"),
+    GatewayStatus(id="g", fleet="f", keys_problem="its certificate expires in 5 days"),
 ]
 
 

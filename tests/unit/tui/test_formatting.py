@@ -66,7 +66,7 @@ def test_bar_has_its_width(fraction: float) -> None:
 
 
 def test_results_are_told_briefly() -> None:
-    """Files are told by name, lists by length, long values are cut."""
+    """Files are shown by name, lists by length, long values are cut."""
     record = SubtaskRecord(
         subtask=Subtask(id="s", skill="photograph"),
         state=SubtaskState.SUCCEEDED,

@@ -27,8 +27,8 @@ from appliance.model import (
     encode,
 )
 from appliance.model.gateways import PlannerStatus, SlotStatus, TierFigures
-from appliance.pool.api import PoolDecision
-from appliance.record.models import RecorderStatus
+from appliance.model.pool_api import PoolDecision
+from appliance.model.recorder_api import RecorderStatus
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.screens import fleet, models
 from appliance.tui.settings import TuiConfig

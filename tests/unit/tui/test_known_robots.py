@@ -64,7 +64,7 @@ def do(store: Store, number: int, what: str, name: str, how: str) -> None:
 
 
 def counted(store: Store) -> dict[str, Robot]:
-    """Return the robots made anew from all that there is; without missions, of which a robot may have several."""
+    """Return the robots made again from all that there is; without missions, of which a robot may have several."""
     leases = leases_of(store.gateways.values())
     questions = questions_of(store.enquiries.values())
     found: dict[str, Robot] = {}
@@ -80,7 +80,7 @@ def counted(store: Store) -> dict[str, Robot]:
 @settings(deadline=None)
 @given(steps=STEPS)
 def test_what_is_followed_is_what_there_is(steps: list[tuple[str, str, str]]) -> None:
-    """However robots, tasks, leases, questions and stops come and go, the rows are those made anew from everything."""
+    """However robots, tasks, leases, questions and stops come and go, the rows are those made again from everything."""
     store, known = Store(tasks=5, entries=5), KnownRobots()
     for number, (what, name, how) in enumerate(steps):
         if what != "look":
@@ -97,7 +97,7 @@ def test_what_is_followed_is_what_there_is(steps: list[tuple[str, str, str]]) ->
 
 
 def test_one_that_is_as_it_was_is_the_same_thing() -> None:
-    """Nothing is made anew for what has not changed, nor for a change that a robot's row does not tell."""
+    """Nothing is made again for what has not changed, nor for a change that a robot's row does not tell."""
     store, known = Store(), KnownRobots()
     for name in NAMES:
         store.robots.put(name, RobotInfo(id=name, kind="zenoh"))

@@ -1,4 +1,5 @@
 """How the screens look at 80x24 and 160x48, in the dark, light and high-contrast themes; and that all can be read."""
+# pyright: basic, reportArgumentType=false, reportAttributeAccessIssue=false
 
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -9,13 +10,14 @@ from msgspec.structs import replace
 
 from appliance.model import PlannerStatus, RunEvent, RunEventKind, SlotStatus, TierFigures
 from appliance.model.gateways import CacheFigures, UpstreamStatus
+from appliance.model.pool_api import DecisionList, PoolDecision
+from appliance.model.recorder_api import RecorderStatus
 from appliance.model.tasks import Phase
-from appliance.pool.api import DecisionList, PoolDecision
-from appliance.record.models import RecorderStatus
 from appliance.tui import formatting, themes
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.settings import TuiConfig
 
+from .learning_runs import fill
 from .pictures import NOW_NS, OTHER_SIZES, SIZES, characters, compare_screen, never_refused, universal_time
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ SCREENS = {
     "pool": ("4",),
     "llm": ("5",),
     "learning": ("6",),
+    "run": ("6", "enter", "down"),
     "help": ("1", "question_mark"),
     "confirm": ("1", "d"),
     "command": ("1", "colon", "d", "r"),
@@ -68,6 +71,7 @@ def fleet(view: "FakeView", monkeypatch: pytest.MonkeyPatch) -> Iterator["FakeVi
             (("start", "2 of 2 are busy and one more run is expected in 4 s"), ("retire", "idle for 600 s"))
         )
     )
+    fill(view)
     view.orders.answers["pool_decisions"] = ({"gw-a": DecisionList(decisions=decisions, counts={})}, {})
     with universal_time(monkeypatch):
         yield view
@@ -80,7 +84,7 @@ async def test_screen_looks_as_it_did(fleet: "FakeView", screen: str, size: tupl
     await compare_screen(fleet, screen, SCREENS[screen], size, write=screen == "confirm")
 
 
-@pytest.mark.parametrize("screen", ["fleet", "gateway", "pool", "llm", "learning"])
+@pytest.mark.parametrize("screen", ["fleet", "gateway", "pool", "llm", "learning", "run"])
 @OTHER_SIZES
 async def test_other_sizes_are_never_refused(fleet: "FakeView", screen: str, size: tuple[int, int]) -> None:
     """Narrower and wider than usual, a screen still shows what comes first in it, and no line is too long."""

@@ -48,7 +48,7 @@ def test_what_is_no_time_is_refused(text: str) -> None:
 
 
 def test_times_are_told() -> None:
-    """Times are told as a clock with tenths."""
+    """Times are shown as a clock with tenths."""
     assert told(0.04) == "00:00.0"
     assert told(83.26) == "01:23.3"
     assert told(3661) == "1:01:01.0"

@@ -10,8 +10,7 @@ from textual.pilot import Pilot
 
 from appliance.errors import ConflictError
 from appliance.model import Decision, Plan, Proposal, Subtask, TaskRecord, TaskState
-from appliance.tasks.api import PlanChecked
-from appliance.tasks.lines import Line, LineKind
+from appliance.model.task_api import Line, LineKind, PlanChecked
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.screens.review import ReviewScreen
 from appliance.tui.screens.tasks import TaskScreen
@@ -108,7 +107,7 @@ async def test_plan_is_edited_checked_and_approved(view: "FakeView") -> None:
 
 
 async def test_order_is_edited_and_taken_back(view: "FakeView") -> None:
-    """`o` writes what a subtask comes after, `[` and `]` exchange neighbours, `u` goes back: each is checked anew."""
+    """`o` writes what a subtask comes after, `[` and `]` exchange neighbours, `u` goes back: each is checked again."""
     app = SwiftbotApp(view, TuiConfig(write=True))
     async with app.run_test(size=SIZE) as pilot:
         screen = await reviewing(app, pilot, view)
@@ -143,14 +142,14 @@ async def test_invalid_edit_is_not_approved(view: "FakeView") -> None:
         await pilot.press("r")
         await until(app, pilot, "edit-robot s1")
         await pilot.press(*"ghost", "enter")
-        await until(app, pilot, "✘ it cannot run so", "robot ghost is unknown")
+        await until(app, pilot, "✘ invalid plan", "robot ghost is unknown")
         await pilot.press("a")
-        await until(app, pilot, "mend what is wrong")
+        await until(app, pilot, "correct it")
         assert view.orders.of("approve") == []
 
 
 async def test_somebody_was_faster(view: "FakeView") -> None:
-    """Of two operators one is told that the other was faster, and who; then what became of the plan."""
+    """Of two operators one hears that the other was faster, and who; then what became of the plan."""
     app = SwiftbotApp(view, TuiConfig(write=True))
     async with app.run_test(size=SIZE) as pilot:
         await reviewing(app, pilot, view)
@@ -158,7 +157,7 @@ async def test_somebody_was_faster(view: "FakeView") -> None:
         await pilot.press("a")
         await until(app, pilot, "Approve the plan")
         await pilot.press("y")
-        await until(app, pilot, "somebody was faster: bea has approved it already")
+        await until(app, pilot, "another operator was faster: bea has approved it already")
         decision = Decision(approved=True, by="bea")
         view.store.take_task(replace(WAITING, state=TaskState.RUNNING, proposal=None, sequence=3, decision=decision))
         await until(app, pilot, "approved by bea", "Esc leaves")

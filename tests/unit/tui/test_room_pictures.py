@@ -8,8 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.model import Enquiry, Notice, Pose, RobotInfo, SoftStop
-from appliance.tasks.api import PlanChecked
-from appliance.tasks.lines import Line, LineKind
+from appliance.model.task_api import Line, LineKind, PlanChecked
 from appliance.tui.replay import LogFile
 from appliance.tui.screens import replay as replay_screen
 

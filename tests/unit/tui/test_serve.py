@@ -20,7 +20,7 @@ def guard() -> Guard:
 
 
 def test_owner_is_let_in(guard: Guard) -> None:
-    """Whoever knows the token and asks for this machine by its own name is let in, by HTTP and WebSocket."""
+    """A browser that knows the token and asks for this machine by its own name is let in, by HTTP and WebSocket."""
     for host in ("127.0.0.1:8000", "localhost:8000", "[::1]:8000", "LOCALHOST:8000"):
         assert guard.refusal({"host": host}, given=TOKEN, socket=False) == ""
         assert guard.refusal({"Host": host, "Origin": f"http://{host.lower()}"}, given=TOKEN, socket=True) == ""

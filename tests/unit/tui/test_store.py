@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import GatewayStatus, RunEvent, RunEventKind, TaskRecord, TaskState
-from appliance.record.models import RecorderStatus
+from appliance.model.recorder_api import RecorderStatus
 from appliance.tui.store import Connection, Shelf, Store
 
 
@@ -111,7 +111,7 @@ def test_lost_gateway_is_kept_with_since_when() -> None:
 
 
 def test_a_problem_keeps_its_beginning() -> None:
-    """As long as the same is wrong with the connection, it is told since when; the same news is no change."""
+    """As long as the same is wrong with the connection, it is shown since when; the same news is no change."""
     store = Store()
     store.tell(Connection(problem="gone", remedy="wait", since_ns=5))
     revision = store.revision("connection")

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Failure, Plan, Proposal, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskState
-from appliance.tasks.views import CandidateWhy, SubtaskWhy, Waits
+from appliance.model.task_api import CandidateWhy, SubtaskWhy, Waits
 from appliance.tui.task_view import (
     brief,
     nodes,
@@ -73,7 +73,7 @@ def test_whatever_a_record_says_is_shown_as_text(record: TaskRecord) -> None:
 
 @given(result=st.dictionaries(HOSTILE, VALUES, max_size=5))
 def test_results_are_shown_whole_and_in_brief(result: dict[str, object]) -> None:
-    """A result of any shape is told in a line, and in full."""
+    """A result of any shape is shown in a line, and in full."""
     assert harmless(brief(result))
     assert harmless(whole(result).plain)
 

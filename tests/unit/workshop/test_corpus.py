@@ -13,10 +13,8 @@ from appliance.skills.catalogue import DOMAINS, Catalogue
 from workshop.bench.plan import default_cases
 from workshop.corpus import load
 from workshop.corpus.__main__ import main
-from workshop.corpus.check import problems
-from workshop.corpus.near import too_near
+from workshop.corpus.check import problems, tally, too_near
 from workshop.corpus.notation import KINDS, Pair, parse, write
-from workshop.corpus.tally import tally
 
 pytestmark = [pytest.mark.thorough, pytest.mark.timeout(900)]  # seconds on a free processor, minutes on a busy one
 
@@ -44,6 +42,7 @@ _PAIR = st.one_of(
         voice=st.from_regex(r"[a-z]{1,8}", fullmatch=True),
         robots=st.lists(_NAME, max_size=3).map(tuple),
         domain=st.sampled_from(DOMAINS),
+        source=st.sampled_from(("", "hand-1", "hand-2")),
         subtasks=st.lists(_SUBTASK, min_size=1, max_size=4).map(tuple),
     ),
     st.builds(Pair, instruction=_TEXT, refused=st.sampled_from(KINDS), reason=st.just("no skill does that")),
@@ -146,7 +145,7 @@ def test_copies_are_found_whatever_their_nouns() -> None:
     ).values()
     plans = {"second": second, "third": third, "other": other}
     found = list(too_near(_plans(plans), _plans({"first": first})))
-    assert [each.split(":")[0] for each in found] == ["second", "third"]
+    assert [line.split(":")[0] for line in found] == ["second", "third"]
 
 
 def test_every_pair_keeps_the_rules(corpus: dict[str, Pair], catalogue: Catalogue) -> None:

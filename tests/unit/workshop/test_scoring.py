@@ -4,7 +4,6 @@ import copy
 import json
 import random
 import runpy
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,9 +12,8 @@ import pytest
 from appliance.llm.language import read
 from appliance.llm.words import words_of
 from appliance.skills.catalogue import load_catalogue
-from workshop import corpus
 from workshop.bench.plan import default_cases
-from workshop.corpus.notation import parse
+from workshop.corpus import load
 from workshop.scoring import mean_figures, score
 from workshop.train.examples import example_of
 
@@ -67,8 +65,7 @@ def test_it_is_the_reference_scorer_s_figures() -> None:
     """Of hand-written plans with things wrong at random every figure is the reference scorer's, of no plan too."""
     theirs: Any = runpy.run_path(str(default_cases().with_name("score.py")))["score_case"]
     catalogue, rng = load_catalogue(), random.Random(5)  # noqa: S311 - what is wrong, not secrets
-    files = sorted(Path(corpus.__file__).parent.glob("*.plan"))
-    pairs = [pair for file in files for pair in parse(file.read_text(), name=file.name).values()]
+    pairs = list(load().values())
     # Few of the thousands are made into examples: that takes milliseconds each.
     examples = [example_of(pair, catalogue) for pair in rng.sample(pairs, 450)]
     examples = [each for each in examples if each.symbols[0] != "none"]

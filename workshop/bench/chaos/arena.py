@@ -17,9 +17,11 @@ from appliance.config import GatewayConfig
 from appliance.connection import Process
 from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
 from appliance.llm.settings import LlmConfig
+from appliance.model.roles import Role
+from appliance.plane.settings import AUTHENTICATED
 from appliance.pool.settings import PoolConfig
 from appliance.record.settings import RecordConfig
-from workshop import local_fleet
+from workshop import keyring, local_fleet
 
 Progress = Callable[[str], None]
 START_S = 180.0
@@ -45,6 +47,9 @@ class Arena:
         base: further settings of every gateway.
         command: what runs a gateway, with the path of its configuration behind.
         recorder: whether a recorder runs beside them.
+        robots: names of the robots that take part; with keys, theirs are made too.
+
+    Where an endpoint is `tls` or `quic`, a new authority issues keys for all (`swiftbot keys`).
     """
 
     def __init__(
@@ -58,7 +63,9 @@ class Arena:
         base: GatewayConfig | None = None,
         command: Sequence[str] = (sys.executable, "-m", "appliance.cli", "gateway", "--config"),
         recorder: bool = True,
+        robots: Sequence[str] = (),
     ) -> None:
+        self._robots = tuple(robots)
         self.fleet = fleet
         self.directory = directory
         self.sites = dict(sites)
@@ -88,6 +95,8 @@ class Arena:
     def prepare(self) -> None:
         """Write the configurations."""
         (self.directory / "logs").mkdir(parents=True, exist_ok=True)
+        if self.secured:
+            self._issue()
         for name, site in self.sites.items():
             config = replace(
                 self._base,
@@ -99,13 +108,28 @@ class Arena:
                     self._base.plane,
                     listen=(site.endpoint,),
                     peers={each: at.endpoint for each, at in self.sites.items()},
+                    keys=self.keys(Role.GATEWAY, name),
                 ),
                 pool=self._pool,
-                record=RecordConfig(directory=str(self.record_dir)),
+                record=RecordConfig(directory=str(self.record_dir), keys=self.keys(Role.RECORDER)),
             )
             path = self._config(name)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(configuration.dump(config))
+
+    @property
+    def secured(self) -> bool:
+        """Whether links are authenticated, so that everybody needs keys."""
+        return any(each.endpoint.partition("/")[0] in AUTHENTICATED for each in self.sites.values())
+
+    def keys(self, role: Role, name: str = keyring.BENCH) -> str:
+        """File with the keys of somebody; empty where links need none."""
+        return str(keyring.file_of(self.directory / "keys", role, name)) if self.secured else ""
+
+    def _issue(self) -> None:
+        """Make new keys for all that take part."""
+        hosts = {name: site.endpoint.partition("/")[2].rpartition(":")[0] for name, site in self.sites.items()}
+        keyring.issue(self.directory / "keys", self.fleet, gateways=hosts, robots=self._robots)
 
     def _config(self, name: str) -> Path:
         return self.directory / name / "gateway.toml"
@@ -146,11 +170,13 @@ class Arena:
         async with await self.client() as client:
             await self.settled(client, ready=ready)
 
-    async def client(self, endpoints: Sequence[str] = (), *, wait_s: float = START_S) -> FleetClient:
-        """Return a client of the fleet, linked to any of the endpoints."""
+    async def client(self, endpoints: Sequence[str] = (), *, wait_s: float = START_S, gateway: str = "") -> FleetClient:
+        """Return a client of the fleet, linked to any of the endpoints; with keys of an engineer, or of a gateway."""
+        keys = self.keys(Role.GATEWAY, gateway) if gateway else self.keys(Role.ENGINEER)
         until = time.monotonic() + wait_s
         while True:
-            client = FleetClient(Endpoint(fleet=self.fleet, connect=tuple(endpoints) or self.endpoints))
+            connect = tuple(endpoints) or self.endpoints
+            client = FleetClient(Endpoint(fleet=self.fleet, connect=connect, keys=keys))
             try:
                 return await client.open()
             except (UnreachableError, SwiftbotError):
@@ -188,6 +214,9 @@ class Arena:
             await local_fleet.remove_containers(self.fleet, progress=progress, volumes=True)
 
 
-def loopback(count: int) -> dict[str, Site]:
-    """Return sites for so many gateways on this machine's loopback."""
-    return {f"gw-{number + 1}": Site(endpoint=f"tcp/127.0.0.1:{local_fleet.free_port()}") for number in range(count)}
+def loopback(count: int, *, secured: bool = False) -> dict[str, Site]:
+    """Return sites for so many gateways on this machine's loopback, with keys or without."""
+    protocol = "tls" if secured else "tcp"
+    return {
+        f"gw-{number + 1}": Site(endpoint=f"{protocol}/127.0.0.1:{local_fleet.free_port()}") for number in range(count)
+    }

@@ -1,4 +1,4 @@
-"""Robots that write what they are told into a file: the effects of a chaos run, counted where they happen.
+"""Robots that write their orders into a file: the effects of a chaos run, counted where they happen.
 
 The file refuses nothing and forgets nothing: each time the robot acts there is one line more. What keeps an effect
 from being done twice is the product's own: the desk and ledger of commands that every robot has, known by the command's
@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from appliance.model import RobotInfo, encode
+from appliance.model import RobotInfo, keyspace
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.robots.executor import CommandExecutor, Done, IdempotencyLog, Verb
@@ -76,14 +76,18 @@ class LedgerRobot:
             halt=self._halt,
             refused=self.refused,
         )
-        self._serving = session.serve(session.keys.command(name), self.desk.handle)
-        self._token = session.declare_alive(session.keys.robot_alive(name))
+        self._serving = session.serve(
+            session.keys(keyspace.COMMAND, name), self.desk.handle, signers=keyspace.COMMAND.asks
+        )
+        self._token = session.declare_alive(session.keys(keyspace.ROBOT_ALIVE, name))
         self._telling = asyncio.create_task(self._tell(), name=f"state of {name}")
 
     @classmethod
-    async def start(cls, name: str, file: LedgerFile, *, fleet: str, connect: Sequence[str]) -> "LedgerRobot":
+    async def start(
+        cls, name: str, file: LedgerFile, *, fleet: str, connect: Sequence[str], keys: str = ""
+    ) -> "LedgerRobot":
         """Connect to the fleet at any of its endpoints; UnreachableError when none answers."""
-        config = PlaneConfig(mode="client", connect=tuple(connect))
+        config = PlaneConfig(mode="client", connect=tuple(connect), keys=keys)
         return cls(name, await Session.open(config, fleet), file)
 
     async def _write(self, args: PickArgs) -> Done:
@@ -96,7 +100,7 @@ class LedgerRobot:
     async def _tell(self) -> None:
         info = RobotInfo(id=self.name, kind="zenoh", verbs=("pick", "stop"))
         while True:
-            self._session.put(self._session.keys.robot(self.name), encode(info))
+            self._session.publish(keyspace.ROBOT, info, self.name)
             await asyncio.sleep(STATE_S)
 
     async def close(self) -> None:

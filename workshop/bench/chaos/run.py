@@ -8,6 +8,7 @@ comes back with its disk, but tasks may stand still until one that holds their r
 import asyncio
 import contextlib
 import shutil
+import signal
 import tempfile
 import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
@@ -16,25 +17,107 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import Struct
 
 from appliance.client import FleetClient
 from appliance.errors import NotFoundError, SwiftbotError
-from appliance.model import LogLine, TaskRecord, TaskRequest
+from appliance.learn.decisions import all_traced
+from appliance.model import LogLine, TaskRecord, TaskRequest, keyspace
+from appliance.model.roles import Role
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.machine import Transition
 from appliance.tasks.replay import check
-from workshop.bench.chaos import account, plan
-from workshop.bench.chaos import sides as both_sides
+from workshop import keyring
+from workshop.bench.chaos import account, partition, plan
 from workshop.bench.chaos.account import Down, Follower, Submitted
 from workshop.bench.chaos.arena import Arena, Progress, Site, loopback
 from workshop.bench.chaos.ledger import LedgerFile, LedgerRobot
-from workshop.bench.chaos.outages import Conditions, carry_out
 from workshop.bench.chaos.partition import AGREE_S, Partitions
 from workshop.bench.net import space
-from workshop.bench.net.faults import Phase, phases
+from workshop.bench.net.faults import REST_S, Phase, phases
 from workshop.bench.pooled import fleet_name, write_skill
+
+
+class Conditions(Struct, frozen=True, kw_only=True):
+    """Under what a fleet is tried."""
+
+    gateways: int
+    seconds: float
+    """How long gateways go down; with faults of the network their times count."""
+    every_s: float
+    """Mean time between outages; 0: there are none."""
+    freezes: float
+    """Share of outages in which the gateway is only stopped and goes on later."""
+    down_at_once: int = 2
+    """r - 1: more than that is not what replication promises to survive without waiting."""
+    seed: int = 1
+    faults: tuple[str, ...] = ()
+    """Faults of the network that it goes through, one after the other (`net.faults`); each gateway has a network
+    namespace of its own then, and the process must be inside one (`net.space.enter`)."""
+    fault_s: float = 0.0
+    """How long each lasts; 0: as a full run has it."""
+    rest_s: float = REST_S
+    secured: bool = False
+    """Whether links have keys; with faults of the network they have, since these are between machines."""
+    keep: str = ""
+    """Folder for data and logs of the run; empty: a temporary one."""
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the gateways."""
+        return tuple(f"gw-{number + 1}" for number in range(self.gateways))
+
+    def phases(self) -> tuple[Phase, ...]:
+        """The faults of the network with their times."""
+        return tuple(phases(self.faults, self.names(), fault_s=self.fault_s, rest_s=self.rest_s, seed=self.seed))
+
+    def outages(self, seconds: float) -> tuple[plan.Outage, ...]:
+        """The outages of so many seconds."""
+        if self.every_s <= 0:
+            return ()
+        return plan.outages(
+            self.names(), seconds=seconds, most=self.down_at_once, every_s=self.every_s, freezes=self.freezes,
+            seed=self.seed,
+        )  # fmt: skip
+
+
+async def carry_out(
+    arena: Arena,
+    planned: Sequence[plan.Outage],
+    began: float,
+    *,
+    progress: Progress,
+    noted: Callable[[plan.Outage], Callable[[], None]] = lambda _: lambda: None,
+) -> None:
+    """Have gateways go down and come back as planned, from `began` (monotonic) on.
+
+    `noted` is called as one goes down; what it returns, when it is back.
+    """
+
+    async def outage(each: plan.Outage) -> None:
+        if each.gateway not in arena.up():
+            progress(f"{each.gateway} is not up when it should go down: see its log")
+            return
+        back = noted(each)
+        if each.kind == "freeze":
+            arena.signal(each.gateway, signal.SIGSTOP)
+        else:
+            await arena.kill(each.gateway)
+        try:
+            await asyncio.sleep(max(0.0, began + each.until_s - time.monotonic()))
+        finally:
+            if each.kind == "freeze":
+                arena.signal(each.gateway, signal.SIGCONT)
+            else:
+                arena.start(each.gateway)
+            back()
+
+    async with asyncio.TaskGroup() as group:
+        for each in planned:
+            await asyncio.sleep(max(0.0, began + each.at_s - time.monotonic()))
+            group.create_task(outage(each))
+
 
 ROBOTS = 4
 CUTS_S = (5.0, 20.0, 60.0)
@@ -98,7 +181,7 @@ class Options(Conditions, frozen=True, kw_only=True):
     containers: int = 1
     """Kept ready by each gateway."""
     orders: int = 1
-    """Rounds of orders on both sides of each partition (`sides.KINDS`): 11 tasks a round."""
+    """Rounds of orders on both sides of each partition (`partition.KINDS`): 11 tasks a round."""
 
     def phases(self) -> tuple[Phase, ...]:
         """The faults of the network with their times; a partition comes several times, short and long."""
@@ -121,10 +204,10 @@ class Trial:
         self.follower = Follower()
         self.submitted: dict[str, Submitted] = {}
         # A peer without a token: linked to every gateway, so that it misses nothing when one of them dies.
-        session, keys = observer, observer.keys
-        session.subscribe_typed(keys.transition(), Transition, self._moved)
-        session.subscribe_typed(keys.task(), TaskRecord, self._told)
-        session.subscribe_typed(keys.log(), LogLine, self._logged)
+        session = observer
+        session.subscribe_typed(keyspace.TRANSITION, self._moved)
+        session.subscribe_typed(keyspace.TASK_UPDATE, self._told)
+        session.subscribe_typed(keyspace.LOG, self._logged)
 
     def _moved(self, key: str, step: Transition | None) -> None:
         del key
@@ -138,7 +221,7 @@ class Trial:
 
     def _logged(self, key: str, line: LogLine | None) -> None:
         if line is not None and line.event == "gateway lost":
-            self.follower.noticed(str(line.fields.get("member", "")), key.split("/")[-2], time.monotonic_ns())
+            self.follower.noticed(str(line.fields.get("member", "")), keyspace.LOG.names(key)[0], time.monotonic_ns())
 
     async def submit(self, wanted: Sequence[plan.Wanted], began: float) -> None:
         """Hand the tasks in when they are wanted."""
@@ -221,9 +304,10 @@ async def trial(
     arena = Arena(
         fleet=fleet_name(),
         directory=folder,
-        sites=sites or loopback(options.gateways),
+        sites=sites or loopback(options.gateways, secured=options.secured),
         pool=PoolConfig(floor={"base": options.containers}, capacity=max(4, options.containers)),
         skills=skills,
+        robots=robots(),
     )
     file = LedgerFile(folder / "ledger.jsonl")
     async with contextlib.AsyncExitStack() as stack:
@@ -231,14 +315,16 @@ async def trial(
         stack.push_async_callback(arena.stop, progress=progress)
         await arena.start_all(progress=progress, ready=options.containers)
         client = await stack.enter_async_context(await arena.client())
-        config = PlaneConfig(mode="peer", connect=arena.endpoints)
+        config = PlaneConfig(mode="peer", connect=arena.endpoints, keys=arena.keys(Role.ENGINEER))
         observer = await Session.open(config, arena.fleet)
         stack.push_async_callback(observer.close)
         it = Trial(options, arena, client, observer, file)
         for number, name in enumerate(robots()):
             side = sides[number % len(sides)] if sides else arena.names
             connect = tuple(arena.sites[each].endpoint for each in side)
-            robot = await LedgerRobot.start(name, file, fleet=arena.fleet, connect=connect)
+            robot = await LedgerRobot.start(
+                name, file, fleet=arena.fleet, connect=connect, keys=arena.keys(Role.ROBOT, name)
+            )
             stack.push_async_callback(robot.close)
         yield it
 
@@ -287,7 +373,13 @@ async def _on_a_bad_wire(options: Options, *, progress: Progress) -> dict[str, A
     ):
         began = time.monotonic()
         partitions = Partitions(
-            it.observer, gateways=names, planned=planned, robots=robots(), rounds=options.orders, seed=options.seed
+            it.observer,
+            gateways=names,
+            planned=planned,
+            robots=robots(),
+            rounds=options.orders,
+            seed=options.seed,
+            operator=keyring.BENCH if it.arena.secured else "",
         )
         faults = space.disturb(wire, planned, began, progress, noted=partitions.noted)
         result = await _run(it, faults, seconds=seconds, progress=progress, partitions=partitions)
@@ -345,14 +437,14 @@ async def judge(
     found: dict[str, Any] = {}
     if partitions is not None and partitions.cuts:
         kept = {each.task: await it.record(each.task, patient=True) for each in contested}
-        found["partitions"] = both_sides.account(partitions.cuts, kept, partitions.notices)
+        found["partitions"] = partition.account(partitions.cuts, kept, partitions.notices)
         records |= kept
         wanted = (*wanted, *partitions.wanted)
     effects = account.effects(wanted, records, it.file.read())
     broken = [
         *(f"{len(tasks[kind])} {kind}" for kind in ("missing", "open", "failed") if tasks[kind]),
         *(f"{effects[kind]} effects {kind}" for kind in ("doubled", "lost", "early", "strange") if effects[kind]),
-        *(both_sides.broken(found["partitions"], within_s=AGREE_S) if found else ()),
+        *(partition.broken(found["partitions"], within_s=AGREE_S) if found else ()),
     ]
     return {
         "held": not broken,
@@ -382,7 +474,7 @@ def keep(result: dict[str, Any], folder: Path, *, asked: bool) -> dict[str, Any]
 def with_check(result: dict[str, Any], logs: Sequence[Path]) -> dict[str, Any]:
     """Return a result with what `swiftbot log check` says of the run's logs."""
     try:
-        report = check(logs)
+        report = check(logs, traced=all_traced())
     except SwiftbotError as error:
         return result | {"decisions": {"problem": error.message}}
     decisions: dict[str, Any] = {

@@ -6,8 +6,7 @@ another process. They do not promise the same: a put here is a compare-and-set o
 and synced to the disks of three gateways before it is acknowledged, where kademlia's last writer wins in memory and
 nothing is ever on a disk. So that the same work is compared too, `put_unsynced` is ours without syncing, and
 `kademlia_durable` the package with a storage that has a value on the disk before it answers; a get asks the owner here
-and takes any copy there, so `get_any_copy` is one that takes the first copy here too. `zenoh_alone` is a
-question and its answer between as many sessions of one process, with no code of ours (`bare`).
+and takes any copy there, so `get_any_copy` is one that takes the first copy here too.
 """
 
 import asyncio
@@ -44,7 +43,7 @@ _BLOCK = 50
 _WARM = 2
 """Turns of each side before any that counts: nodes meet, make links and files once, and run for days."""
 _KINDS = ("put", "get", "get_any_copy", "put_unsynced")
-_LINE_S = 60.0
+LINE_S = 60.0
 _VALUE = "x" * 400
 _FIRST_PORT, _LAST_PORT = 20_000, 30_000
 
@@ -69,7 +68,7 @@ async def run(
     """Measure `count` puts and gets on both sides, after some that do not count.
 
     Returns:
-        `swiftbot`, `kademlia`, `kademlia_durable` and, in one process, `zenoh_alone`: what each did of `put`, `get`,
+        `swiftbot`, `kademlia` and `kademlia_durable`: what each did of `put`, `get`,
         `get_any_copy` and `put_unsynced`, each count, p50, p90, p99 and max in ms; `cpu_ms_each` (one process),
         processor time of an operation, which other work on the machine changes less. The ratios of the medians and of
         p99. `kademlia` is `missing`, with how to install it, where it is not there.
@@ -84,9 +83,6 @@ async def run(
         sides: dict[str, Side] = {"swiftbot": await _our_side(stack, nodes, folder, layout)}
         ops: dict[str, tuple[str, ...]] = {"swiftbot": ("put", "get", "get_any_copy", "put_unsynced")}
         result: dict[str, Any] = {"nodes": nodes, "layout": layout, "value_bytes": len(_VALUE)}
-        if layout == "one process":
-            progress(f"{nodes} sessions of Zenoh alone")
-            sides["zenoh_alone"], ops["zenoh_alone"] = await _zenoh_alone(stack, nodes), ("get",)
         if python is None:
             progress(f"kademlia is not installed: {REMEDY}")
             result["kademlia"] = {"missing": "kademlia is not installed", "remedy": REMEDY}
@@ -145,6 +141,15 @@ class Side(Protocol):
     def about(self) -> dict[str, Any]:
         """What else belongs to the result."""
         ...
+
+
+@asynccontextmanager
+async def node_process(options: NodeOptions) -> AsyncGenerator[asyncio.subprocess.Process]:
+    """A gateway's plane in a process of its own that is ready; ended afterwards."""
+    command = (sys.executable, "-m", "workshop.bench.dht.node", msgspec.json.encode(options).decode())
+    async with _process(*command) as process:
+        await line_of(process, "ready")
+        yield process
 
 
 async def _our_side(stack: AsyncExitStack, nodes: int, folder: Path, layout: Layout) -> Side:
@@ -219,7 +224,7 @@ async def _planes(nodes: int, folder: Path) -> AsyncGenerator[list[Plane]]:
             config = PlaneConfig(listen=(listen,), connect=() if number == 0 else (first,))
             data = folder / f"g{number}"
             planes.append(await Plane.open(config, fleet=fleet, gateway=f"g{number}", data_dir=data))
-        async with asyncio.timeout(_LINE_S):
+        async with asyncio.timeout(LINE_S):
             while not all(  # noqa: ASYNC110 - no single event says so of all
                 len(each.members()) == nodes and each.dht.settling.reconciled() for each in planes
             ):
@@ -269,13 +274,6 @@ class _Processes:
         return {**self._about, "failed": self._failed, **cpu}
 
 
-async def _zenoh_alone(stack: AsyncExitStack, nodes: int) -> Side:
-    command = (sys.executable, "-m", "workshop.bench.dht.bare", str(nodes))
-    process = await stack.enter_async_context(_process(*command))
-    await line_of(process, "ready")
-    return _Processes([process])
-
-
 async def _kademlia(
     stack: AsyncExitStack, python: Path, nodes: int, layout: Layout, *, durable: Path | None = None
 ) -> Side:
@@ -318,10 +316,10 @@ async def line_of(process: asyncio.subprocess.Process, event: str) -> dict[str, 
     if process.stdout is None or process.stderr is None:
         raise SwiftbotError("a side has no pipes")
     try:
-        async with asyncio.timeout(_LINE_S):
+        async with asyncio.timeout(LINE_S):
             line = await process.stdout.readline()
     except TimeoutError:
-        raise SwiftbotError(f"a side told no {event} within {_LINE_S:g} s") from None
+        raise SwiftbotError(f"a side told no {event} within {LINE_S:g} s") from None
     if not line:
         problem = (await process.stderr.read(2**16)).decode(errors="replace").strip()
         raise SwiftbotError(f"a side ended: {problem[-400:] or 'without a word'}", remedy=REMEDY)

@@ -35,6 +35,9 @@ class NodeOptions(Struct, frozen=True, kw_only=True):
     listen: str
     connect: tuple[str, ...]
     members: int
+    peers: dict[str, str] = {}
+    """All of them, instead of `connect` (`plane.peers`)."""
+    keys: str = ""
 
 
 async def do(dht: Dht, command: dict[str, Any]) -> dict[str, Any]:
@@ -57,7 +60,7 @@ async def serve(options: NodeOptions) -> None:
     """Join, obey, leave."""
     reader = asyncio.StreamReader(limit=2**24)
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    config = PlaneConfig(listen=(options.listen,), connect=options.connect)
+    config = PlaneConfig(listen=(options.listen,), connect=options.connect, peers=options.peers, keys=options.keys)
     plane = await Plane.open(config, fleet=options.fleet, gateway=options.gateway, data_dir=Path(options.folder))
     try:
         while len(plane.members()) < options.members or not plane.dht.settling.reconciled():  # noqa: ASYNC110 - no single event says so

@@ -18,16 +18,16 @@ from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError, UnreachableError
 from appliance.llm.settings import LlmConfig
-from appliance.plane.records import Found, KeyAsk, RecordChange, Written
+from appliance.model import keyspace
+from appliance.model.plane_api import KeyAsk, RecordChange
 from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from workshop import local_fleet
 from workshop.bench.chaos.arena import Arena, Progress, loopback
-from workshop.bench.failover.logs import LogTail
+from workshop.bench.failover.takeover import LogTail
 from workshop.bench.figures import summary
-from workshop.bench.pooled import fleet_name
-from workshop.bench.workspace import workspace
+from workshop.bench.pooled import fleet_name, workspace
 
 GOAL_MS = 31.0
 STEP_S = 60.0
@@ -44,6 +44,7 @@ class Options(Struct, frozen=True, kw_only=True):
     """In the ring, so that there is something to compare."""
     how: Literal["stop", "kill"] = "stop"
     lease_ms: int = 1000
+    secured: bool = False
 
 
 async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
@@ -58,12 +59,15 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
             id="gw-1", llm=LlmConfig(tiers=("rules",)), plane=PlaneConfig(lease_ms=options.lease_ms), drain_s=5.0
         )
         arena = Arena(
-            fleet=fleet_name(), directory=folder, sites=loopback(options.gateways), base=base,
+            fleet=fleet_name(), directory=folder, base=base,
+            sites=loopback(options.gateways, secured=options.secured),
             pool=PoolConfig(mode="cold", floor={}, capacity=1),
         )  # fmt: skip
         try:
             await arena.start_all(progress=progress, ready=0)
-            async with await arena.client([arena.sites[arena.names[1]].endpoint]) as client:
+            # Only gateways ask each other for what is measured.
+            asked = arena.names[1]
+            async with await arena.client([arena.sites[asked].endpoint], gateway=asked) as client:
                 return await _measure(options, arena, client, progress)
         finally:
             await arena.stop(progress=progress)
@@ -73,7 +77,7 @@ async def _measure(options: Options, arena: Arena, client: FleetClient, progress
     other, victim = arena.names[1], arena.names[-1]
     for number in range(options.records):
         change = RecordChange(key=f"bench/{number}", value=b"x" * 400)
-        await client.plane.rpc.call(other, "record_write", change, Written)
+        await client.plane.rpc.call(other, keyspace.RECORD_WRITE, change)
     ring = Ring(arena.names, virtual_nodes=PlaneConfig().virtual_nodes)
     owned = next(key for at in range(10**6) if ring.owner(key := f"key/{at}") == victim)
     own: dict[str, list[float]] = {stage: [] for stage in STAGES}
@@ -86,7 +90,7 @@ async def _measure(options: Options, arena: Arena, client: FleetClient, progress
         at["came" if alive else "went"] = time.monotonic()
         came.set()
 
-    watch = client.plane.session.watch_alive(client.plane.keys.alive(victim), on_token)
+    watch = client.plane.session.watch_alive(client.plane.keys(keyspace.GATEWAY_ALIVE, victim), on_token)
     for number in range(options.rounds):
         await _end(arena, victim, options.how)
         await _until(came, lambda: at.get("went", 0.0) > at.get("came", 0.0), f"{victim} is still seen")
@@ -150,7 +154,7 @@ async def _answer(client: FleetClient, gateway: str, key: str) -> float:
     give_up = time.monotonic() + STEP_S
     while True:
         try:
-            await client.plane.rpc.call(gateway, "dht_read", KeyAsk(key), Found, timeout_s=5.0)
+            await client.plane.rpc.call(gateway, keyspace.DHT_READ, KeyAsk(key), timeout_s=5.0)
         except UnreachableError:
             await asyncio.sleep(0.001)
         except SwiftbotError:

@@ -12,10 +12,13 @@ same record once they have met.
 
 import asyncio
 import contextlib
+import json
 import signal
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
 from typing import Any, Literal
 
 from msgspec import Struct
@@ -24,18 +27,70 @@ from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import DeadlineError, SwiftbotError
 from appliance.llm.settings import LlmConfig
-from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState, keyspace
+from appliance.model.task_api import TaskAsk
 from appliance.plane.ring import Ring
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.api import TaskAsk
-from appliance.tasks.context import task_key
 from appliance.tasks.machine import Transition, TransitionKind
+from appliance.tasks.records import task_key
 from workshop.bench.chaos.arena import Arena, Progress, loopback
-from workshop.bench.failover.logs import LOOK_S, LogTail, wall_s
 from workshop.bench.figures import summary
-from workshop.bench.pooled import SKILL, fleet_name, write_skill
-from workshop.bench.workspace import workspace
+from workshop.bench.pooled import SKILL, fleet_name, workspace, write_skill
+
+LOOK_S = 0.005
+"""Between two looks at a file."""
+
+
+class LogTail:
+    """The lines of a log file from where it ends now, decoded; lines that are no JSON are left out."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._at = path.stat().st_size if path.exists() else 0
+        self._rest = b""
+        self._unread: list[dict[str, Any]] = []
+
+    def read(self) -> list[dict[str, Any]]:
+        """The lines that have come since, and those that `until` left."""
+        found, self._unread = [*self._unread, *self._new()], []
+        return found
+
+    def _new(self) -> list[dict[str, Any]]:
+        if not self._path.exists():
+            return []
+        with self._path.open("rb") as file:
+            file.seek(self._at)
+            found = file.read()
+        self._at += len(found)
+        *lines, self._rest = (self._rest + found).split(b"\n")
+        decoded: list[dict[str, Any]] = []
+        for line in lines:
+            try:
+                each = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(each, dict):
+                decoded.append(each)  # pyright: ignore[reportUnknownArgumentType]
+        return decoded
+
+    async def until(self, wanted: Callable[[dict[str, Any]], bool], what: str, *, wait_s: float) -> dict[str, Any]:
+        """The next line that is wanted, without those before it; DeadlineError, which says `what`, after `wait_s`."""
+        give_up = time.monotonic() + wait_s
+        while time.monotonic() < give_up:
+            lines = self.read()
+            for number, line in enumerate(lines):
+                if wanted(line):
+                    self._unread = lines[number + 1 :]
+                    return line
+            await asyncio.sleep(LOOK_S)
+        raise DeadlineError(f"{what}: not in {self._path} within {wait_s:g} s", remedy="see the end of that file")
+
+
+def wall_s(line: dict[str, Any]) -> float:
+    """When a line was written, Unix seconds of the machine that all processes share."""
+    return datetime.fromisoformat(str(line["timestamp"])).timestamp()
+
 
 STEP_S = 120.0
 ENDED_S = 2.0
@@ -66,6 +121,7 @@ class Options(Struct, frozen=True, kw_only=True):
     sleep_ms: float = 3000.0
     lease_ms: int = 1000
     image: str = "base"
+    secured: bool = False
 
 
 class Heard:
@@ -77,10 +133,7 @@ class Heard:
     def __init__(self, clients: Sequence[FleetClient]) -> None:
         self._ended: dict[tuple[str, str], dict[int, set[tuple[str, int]]]] = {}
         """Task and subtask -> attempts that succeeded -> who has told so, as which transition of the record."""
-        self._closers = [
-            client.plane.session.subscribe_typed(client.plane.session.keys.transition(), Transition, self._take)
-            for client in clients
-        ]
+        self._closers = [client.plane.session.subscribe_typed(keyspace.TRANSITION, self._take) for client in clients]
 
     def _take(self, _: str, transition: Transition | None) -> None:
         if transition is not None:
@@ -224,7 +277,8 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
             id="gw-1", llm=LlmConfig(tiers=("rules",)), plane=PlaneConfig(lease_ms=options.lease_ms), drain_s=5.0
         )
         arena = Arena(
-            fleet=fleet_name(), directory=folder / "fleet", sites=loopback(options.gateways), base=base,
+            fleet=fleet_name(), directory=folder / "fleet", base=base,
+            sites=loopback(options.gateways, secured=options.secured),
             pool=PoolConfig(floor={options.image: 1}, capacity=3), skills=skills,
         )  # fmt: skip
         try:
@@ -327,7 +381,7 @@ class _Rounds:
 
     async def _record(self, gateway: str, task: str) -> TaskRecord:
         """A task's record as a gateway has it."""
-        return await self._client.plane.rpc.call(gateway, "task", TaskAsk(id=task), TaskRecord)
+        return await self._client.plane.rpc.call(gateway, keyspace.TASK, TaskAsk(id=task))
 
     async def _submit(self, prefix: str) -> list[str]:
         steps = (

@@ -22,12 +22,11 @@ from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import SwiftbotError
 from appliance.llm.settings import LlmConfig
-from appliance.model import Notice, TaskState
+from appliance.model import Notice, TaskState, keyspace
+from appliance.model.robot_api import LinkAdd, MavlinkLink
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
-from appliance.robots.api import LinkAdd
 from appliance.robots.client import TaskClient, TaskRejected
-from appliance.robots.settings import MavlinkLink
 from workshop import local_fleet
 from workshop.bench.figures import summary
 from workshop.bench.mavlink.relay import BadLink, Badness
@@ -143,13 +142,12 @@ async def _deliver(client: FleetClient, options: Options, *, progress: Progress)
     gateway = min(client.plane.members())
     await client.robot_link_add(gateway, LinkAdd(link=MavlinkLink(listen=url), by="swiftbot bench"))
     notices = Counter[str]()
-    keys = client.plane.keys
 
     def take(_: str, notice: Notice | None) -> None:
         if notice is not None:
             notices[notice.text] += 1
 
-    closer = client.plane.session.subscribe_typed(keys.notice(), Notice, take)
+    closer = client.plane.session.subscribe_typed(keyspace.NOTICE, take)
     run_name = secrets.token_hex(3)
     tasks = [f"d-{run_name}-{number}" for number in range(options.tasks)]
     link = BadLink(("127.0.0.1", port), options.badness)

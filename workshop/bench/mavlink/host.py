@@ -19,10 +19,10 @@ from msgspec import Struct, field
 
 from appliance import logs
 from appliance.model import Site
+from appliance.model.robot_api import LinkList, LinksAsk
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.plane.store import Store
-from appliance.robots.api import LinkList, LinksAsk
 from appliance.robots.hub import RobotHub
 from appliance.robots.settings import RobotsConfig
 

@@ -26,7 +26,7 @@ class Badness(Struct, frozen=True, kw_only=True):
 
 
 class BadLink:
-    """Relays between whoever sends to `port` and one target; each sender is another one to the target, too."""
+    """Relays between all that send to `port` and one target; each sender is another one to the target, too."""
 
     def __init__(self, target: tuple[str, int], badness: Badness) -> None:
         self._target = target

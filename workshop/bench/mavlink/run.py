@@ -21,11 +21,12 @@ import psutil
 from msgspec import Struct
 
 from appliance.errors import PrerequisiteError
-from appliance.plane.keys import Keys
+from appliance.model.keys import Keys
+from appliance.model.robot_api import MavlinkLink
 from appliance.ports import free_port
 from appliance.record.reader import read
 from appliance.robots.mavlink.dialect import Codec, Frame, check, make
-from appliance.robots.settings import MavlinkLink, RobotsConfig
+from appliance.robots.settings import RobotsConfig
 from workshop.bench.figures import ratio
 from workshop.bench.mavlink import others, tlog
 from workshop.bench.mavlink.host import FLEET, Host, Told

@@ -24,11 +24,12 @@ from msgspec import Struct
 from appliance import logs
 from appliance.errors import SwiftbotError, UnreachableError
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus
+from appliance.plane.events import FactsChanged, FleetEvent, Joined, Lost, Stage
 from appliance.plane.node import Plane
 from appliance.plane.settings import PlaneConfig
 
 STATUS_S = 2.0
-"""How often a gateway gives an account of itself when nothing changes; the registry decides what is told of it."""
+"""How often a gateway gives an account of itself when nothing changes; the registry decides what is published of it."""
 _LOOK_S = 0.02
 _TRIES = 5
 _IMAGES = ("base", "vision")
@@ -95,21 +96,20 @@ class Host:
         raise AssertionError
 
     def _watch(self, name: str, plane: Plane) -> None:
-        def came(other: str) -> None:
-            self._came.setdefault(other, {})[name] = time.monotonic()
+        def on_event(event: FleetEvent) -> None:
+            match event:
+                case Joined(other):
+                    self._came.setdefault(other, {})[name] = time.monotonic()
+                case Lost(other):
+                    self._went.setdefault(other, {})[name] = time.monotonic()
+                case FactsChanged("gateway"):
+                    for other in self._awaited:
+                        if other in plane.registry.gateways:
+                            self._told.setdefault(other, {}).setdefault(name, time.monotonic())
+                case _:
+                    pass
 
-        def went(other: str) -> None:
-            self._went.setdefault(other, {})[name] = time.monotonic()
-
-        def fact(kind: str) -> None:
-            if kind == "gateway":
-                for other in self._awaited:
-                    if other in plane.registry.gateways:
-                        self._told.setdefault(other, {}).setdefault(name, time.monotonic())
-
-        plane.on_member_joined.append(came)
-        plane.on_member_lost.append(went)
-        plane.registry.on_change.append(fact)
+        plane.events.subscribe(Stage.WATCHERS, on_event)
 
     async def _keep_publishing(self, name: str, plane: Plane) -> None:
         """What an idle gateway tells of itself."""

@@ -1,7 +1,7 @@
 """Some hundred members behind one router on this machine: what they cost, and how fast the fleet hears of one.
 
 Processes: the router, hosts with some dozens of members each, and for each newcomer a process of its own, which is
-killed with SIGKILL. Times are told by the members themselves, on the machine's monotonic clock.
+killed with SIGKILL. Times are taken by the members themselves, on the machine's monotonic clock.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ Progress = Callable[[str], None]
 PATIENCE_S = 300.0
 """For one step of all members: opening them takes longest."""
 SETTLE_S = 240.0
-"""For all to know each other: less, so that whoever is late can say what it lacks."""
+"""For all to know each other: less, so that a late member can say what it lacks."""
 END_S = 10.0
 
 
@@ -48,7 +48,7 @@ class Options(Struct, frozen=True, kw_only=True):
 
 
 class Side:
-    """A process that does what it is told, a line each way."""
+    """A process that takes commands, a line each way."""
 
     def __init__(self, process: asyncio.subprocess.Process, name: str) -> None:
         self.process = process

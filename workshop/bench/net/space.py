@@ -137,7 +137,7 @@ async def net(gateways: Sequence[str], *, seed: int) -> AsyncGenerator[Net]:
                 ("ip", "link", "set", f"g{number}", "up"),
             ):
                 _run(*inside, *command)
-            sites[name] = Site(endpoint=f"tcp/10.77.0.{number}:{PORT}", enter=inside)
+            sites[name] = Site(endpoint=f"tls/10.77.0.{number}:{PORT}", enter=inside)
         _veth("w0", "me0")
         _ip("address", "add", "10.77.0.254/24", "dev", "me0")
         _ip("link", "set", "me0", "up")

@@ -2,7 +2,7 @@
 
 A real gateway in a process of its own is asked over the key space, as operators' tools ask. Every instruction ends in a
 plan, in a clear answer that there is none, or in a refusal with the time after which to ask again; what ends in nothing
-is lost, and there must be none. Latency is that of whoever asks, from when the instruction was due.
+is lost, and there must be none. Latency is the client's, from when the instruction was due.
 """
 
 import asyncio
@@ -21,9 +21,9 @@ from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, PlanError, RefusedError, SwiftbotError
 from appliance.llm.settings import LlmConfig
-from appliance.model import PlannerStatus
+from appliance.model import PlannerStatus, keyspace
+from appliance.model.task_api import PlanAsk
 from appliance.pool.settings import PoolConfig
-from appliance.tasks.api import PlanAnswer, PlanAsk
 from workshop import local_fleet
 from workshop.bench.figures import summary
 from workshop.local_fleet import Order
@@ -100,7 +100,7 @@ async def run(
                 if model:
                     await _until_ready(client, gateway)
                 told = await _offer(client, gateway, rate=rate, seconds=seconds, progress=progress)
-                await asyncio.sleep(2.5)  # its status is told every two seconds
+                await asyncio.sleep(2.5)  # its status is published every two seconds
                 known = client.plane.registry.gateways.get(gateway)
         finally:
             await local_fleet.down(order.directory, progress=progress, volumes=True)
@@ -161,7 +161,7 @@ async def _offer(client: FleetClient, gateway: str, *, rate: float, seconds: flo
 async def _ask(client: FleetClient, gateway: str, text: str, due: float) -> Told:
     kind, why, retry_after_s = "plan", "", 0.0
     try:
-        await client.plane.rpc.call(gateway, "plan", PlanAsk(instruction=text), PlanAnswer, timeout_s=PATIENCE_S)
+        await client.plane.rpc.call(gateway, keyspace.PLAN, PlanAsk(instruction=text), timeout_s=PATIENCE_S)
     except PlanError:
         kind = "no plan"
     except RefusedError as error:

@@ -11,7 +11,7 @@ cases put to the real cascade with the upstream stand-in, several at a time.
 import asyncio
 import importlib.util
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,11 +24,115 @@ from appliance.llm.batch import everyman, prediction
 from appliance.llm.cascade import Decomposer, Slot
 from appliance.llm.routing import Budget
 from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
+from appliance.llm.tier import Proposal
 from appliance.llm.tiers import configured
-from appliance.model import Plan, Tier
+from appliance.model import Plan, Subtask, Tier
 from appliance.skills.catalogue import Catalogue, load_catalogue
-from workshop.bench.plan.curve import UPSTREAM_MS, Answered, GoldTier, curve, gold_plan
+from workshop.bench.figures import quantile
+from workshop.bench.plan.rosters import by_size
 from workshop.scoring import Score, mean_figures
+
+UPSTREAM_MS = 1280.0
+"""GPT-4o's latency in the paper (Table: task decomposition across models)."""
+THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(21))
+
+
+class Answered(Struct, frozen=True, kw_only=True):
+    """What the first tier made of a case."""
+
+    confidence: float
+    """0 for a case that it had no plan for."""
+    latency_ms: float
+    row: Mapping[str, Any]
+    """The scorer's figures of it."""
+    gold: Mapping[str, Any]
+    """The same of the gold plan itself: not every figure is defined for every case."""
+
+
+def curve(
+    answered: Sequence[Answered], *, thresholds: Sequence[float] = THRESHOLDS, upstream_ms: float = UPSTREAM_MS
+) -> list[dict[str, Any]]:
+    """Return accuracy, share escalated and latency for each threshold. Pure.
+
+    Args:
+        answered: what the first tier made of each case.
+        thresholds: confidences below which a case is escalated.
+        upstream_ms: latency of an escalated case, beside the first tier's own.
+    """
+    points: list[dict[str, Any]] = []
+    for threshold in thresholds:
+        escalated = [each.confidence < threshold or not each.confidence for each in answered]
+        rows = [each.gold if up else each.row for each, up in zip(answered, escalated, strict=True)]
+        times = sorted(
+            each.latency_ms + (upstream_ms if up else 0.0) for each, up in zip(answered, escalated, strict=True)
+        )
+        points.append(
+            {
+                "threshold": threshold,
+                "escalated": round(100 * sum(escalated) / max(1, len(answered)), 1),
+                "decomposition": _mean(rows, "decomposition"),
+                "parallel_recall": _mean(rows, "parallel_recall"),
+                "exact": _mean(rows, "exact"),
+                "mean_ms": round(sum(times) / max(1, len(times)), 1),
+                "p50_ms": round(quantile(times, 0.5), 1) if times else None,
+                "p99_ms": round(quantile(times, 0.99), 1) if times else None,
+            }
+        )
+    return points
+
+
+def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float | None:
+    values = [float(row[name]) for row in rows if row[name] is not None]
+    return round(100 * sum(values) / len(values), 1) if values else None
+
+
+class GoldTier:
+    """An upstream model that is always right: gives the gold plan of an instruction after a while.
+
+    Args:
+        plans: by instruction.
+        delay_ms: how long it takes.
+    """
+
+    name = Tier.UPSTREAM
+    repairs = False
+    model = "gold"
+
+    def __init__(self, plans: Mapping[str, Plan], *, delay_ms: float = UPSTREAM_MS) -> None:
+        self._plans = plans
+        self._delay_s = delay_ms / 1000
+
+    async def start(self) -> None:
+        """It is ready."""
+
+    async def propose(
+        self, context: PlanContext, *, previous: Plan | None = None, problems: tuple[str, ...] = ()
+    ) -> Proposal:
+        """Give the gold plan."""
+        del previous, problems
+        await asyncio.sleep(self._delay_s)
+        return Proposal(plan=self._plans[context.instruction], confidence=1.0, model=self.model)
+
+    async def close(self) -> None:
+        """Nothing to release."""
+
+
+def gold_plan(gold: Mapping[str, Any]) -> Plan:
+    """Return the gold plan of a case as a plan."""
+    return Plan(
+        domain=str(gold.get("domain", "")),
+        subtasks=tuple(
+            Subtask(
+                id=str(each["id"]),
+                skill=str(each["skill"]),
+                robot=each.get("robot"),
+                params=dict(each.get("params") or {}),
+                after=tuple(each.get("after") or ()),
+            )
+            for each in gold["subtasks"]
+        ),
+    )
+
 
 Progress = Callable[[str], None]
 AT_ONCE = 16
@@ -55,6 +159,7 @@ async def run(
     config: LlmConfig | None = None,
     limit: int = 0,
     upstream: bool = True,
+    sizes: Sequence[int] = (),
     progress: Progress = lambda _: None,
 ) -> dict[str, Any]:
     """Plan every case and score the plans.
@@ -64,12 +169,14 @@ async def run(
         config: tiers to measure; by default the rules alone. Thresholds count for `taken` only.
         limit: use the first so many cases; 0 for all.
         upstream: also put the cases to the real cascade with the upstream stand-in.
+        sizes: also give the orders of `rosters` to fleets of so many robots.
         progress: told each case whose plan is not exact.
 
     Returns:
         `all` and `taken`: percent by figure and the number of cases; `by_domain`: decomposition by domain;
         `latency_ms`: p50 and p99; `tiers`: how often each tier's plan was used; `routed_on`: the tier whose confidence
-        decides; `curve`: accuracy against share escalated, by threshold; `cascade`: the real cascade with the stand-in.
+        decides; `curve`: accuracy against share escalated, by threshold; `cascade`: the real cascade with the stand-in;
+        `rosters`: `rosters.by_size`.
 
     Raises:
         NotFoundError: the cases or their scorer are not there.
@@ -140,6 +247,7 @@ async def run(
         "upstream": f"gold plans after {UPSTREAM_MS:g} ms",
         "curve": curve(answered),
         "cascade": await _cascade(found, wanted, catalogue, score) if upstream else None,
+        "rosters": await by_size(wanted, sizes=sizes),
     }
 
 

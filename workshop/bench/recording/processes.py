@@ -27,7 +27,7 @@ FLEET = "bench"
 
 
 class Job(msgspec.Struct, kw_only=True):
-    """What a process is told."""
+    """What a process shall do."""
 
     endpoint: str
     folder: str = ""
@@ -38,7 +38,7 @@ class Job(msgspec.Struct, kw_only=True):
 
 
 def say(**told: Any) -> None:
-    """Tell whoever started this."""
+    """Print a line for the parent process."""
     sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
     sys.stdout.flush()
 
@@ -73,7 +73,7 @@ def send(job: Job) -> None:
 
 
 def record(job: Job) -> None:
-    """Record with the product's recorder until it is told to end."""
+    """Record with the product's recorder until it is asked to end."""
     config = RecordConfig(directory=job.folder, free_bytes=0, total_bytes=0, status_s=0.1)
 
     async def go() -> None:

@@ -22,7 +22,7 @@ from msgspec import Struct
 
 from appliance.client import FleetClient
 from appliance.errors import DeadlineError, PoolError, SwiftbotError
-from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.model import Plan, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState, keyspace
 from appliance.pool.settings import PoolConfig
 from workshop.bench import actors
 from workshop.bench.chaos.arena import Arena, Progress, loopback
@@ -98,7 +98,7 @@ class Load:
         self._number = 0
         self._prefix = f"b{os.getpid()}-{time.monotonic_ns() % 100_000}-"
         plane = client.plane
-        plane.session.subscribe_typed(plane.keys.task(), TaskRecord, self._told)
+        plane.session.subscribe_typed(keyspace.TASK_UPDATE, self._told)
 
     def _told(self, key: str, record: TaskRecord | None) -> None:
         del key
@@ -213,7 +213,7 @@ async def _kill_worker(load: Load, client: FleetClient) -> float:
         ):
             running.put_nowait(record)
 
-    closer = plane.session.subscribe_typed(plane.keys.task(), TaskRecord, told)
+    closer = plane.session.subscribe_typed(keyspace.TASK_UPDATE, told)
     ending = asyncio.create_task(load.one(1, RECOVER))
     try:
         async with asyncio.timeout(PATIENCE_S):
@@ -247,9 +247,8 @@ async def _ray(options: Options, *, progress: Progress) -> dict[str, Any]:
         return {"missing": "Ray is not installed", "remedy": actors.REMEDY}
     progress("Ray: the same")
     with tempfile.TemporaryDirectory(prefix="swiftbot-ray-") as folder:
-        arguments = (str(options.seconds), str(options.kills), folder, *map(str, options.parallel))
-        side = Path(__file__).with_name("ray_side.py")
-        async with actors.side(python, side, arguments, folder) as process:
+        arguments = ("throughput", str(options.seconds), str(options.kills), folder, *map(str, options.parallel))
+        async with actors.side(python, arguments, folder) as process:
             wait_s = actors.WAIT_S + (options.seconds + 5.0) * len(options.parallel) + 20.0 * options.kills
             found = {each: await actors.line(process, each, wait_s) for each in ("ready", "throughput", "recovery")}
     return {

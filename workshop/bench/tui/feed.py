@@ -28,14 +28,13 @@ from appliance.model import (
     TaskRecord,
     TaskState,
     Tier,
-    encode,
+    keyspace,
 )
-from appliance.plane.membership import Facts, FactsAsk, Known
-from appliance.plane.node import Member, MemberAsk
+from appliance.model.plane_api import Facts, FactsAsk, Known, Member, MemberAsk
+from appliance.model.task_api import TaskList, TasksAsk
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
-from appliance.tasks.api import TaskList, TasksAsk
 
 _TICK_S = 0.02
 _CONTAINERS = 4
@@ -119,10 +118,10 @@ class Feed:
                     tuple(each for each in known if each.gateway > ask.after) if ask.all else (),
                 )  # fmt: skip
 
-            rpc.register("facts", FactsAsk, facts, exchange=False)
-            rpc.register("member", MemberAsk, _member, exchange=False)
-            rpc.register("tasks", TasksAsk, self._listed, exchange=False)
-            self._session.declare_alive(keys.alive(status.id))
+            rpc.register(keyspace.FACTS, facts)
+            rpc.register(keyspace.MEMBER, _member)
+            rpc.register(keyspace.TASKS, self._listed)
+            self._session.declare_alive(keys(keyspace.GATEWAY_ALIVE, status.id))
 
     async def _listed(self, ask: TasksAsk) -> TaskList:
         return TaskList(tasks=tuple(reversed(self._tasks[-ask.limit :])))
@@ -151,14 +150,14 @@ class Feed:
             else:
                 name = self._chance.choice(self._gateways).id
                 line = LogLine(at_ns=time.time_ns(), level="info", source=name, event="container started")
-                self._session.put(self._session.keys.log(name), encode(line))
+                self._session.publish(keyspace.LOG, line, name)
             self.put += 1
 
     def _put_gateway(self, number: int) -> None:
         status = self._gateways[number] = replace(
             self._gateways[number], load=self._chance.random(), cpu_percent=100 * self._chance.random()
         )
-        self._session.put(self._session.keys.status(status.id), encode(status))
+        self._session.publish(keyspace.STATUS, status, status.id)
 
     def _put_container(self, number: int) -> None:
         gateway = self._gateways[number].id
@@ -166,21 +165,21 @@ class Feed:
         busy = first.state is ContainerState.READY
         first = replace(first, state=ContainerState.BUSY if busy else ContainerState.READY, runs=first.runs + 1)
         self._containers[gateway] = (first, *others)
-        self._session.put(self._session.keys.container(gateway, first.id), encode(first))
+        self._session.publish(keyspace.CONTAINER, first, gateway, first.id)
 
     def _put_robot(self, number: int) -> None:
         pose = Pose(x=100 * self._chance.random(), y=100 * self._chance.random(), z=10.0)
         info = self._robots[number] = replace(
             self._robots[number], pose=pose, battery_percent=100 * self._chance.random()
         )
-        self._session.put(self._session.keys.robot(info.id), encode(info))
+        self._session.publish(keyspace.ROBOT, info, info.id)
 
     def _put_task(self, number: int) -> None:
         record = self._tasks[number]
         first, *others = record.subtasks
         first = replace(first, progress=self._chance.random(), note=f"leg {record.sequence}")
         record = self._tasks[number] = replace(record, subtasks=(first, *others), sequence=record.sequence + 1)
-        self._session.put(self._session.keys.task(record.id), encode(record))
+        self._session.publish(keyspace.TASK_UPDATE, record, record.id)
 
 
 async def _member(ask: MemberAsk) -> Member:

@@ -21,6 +21,7 @@ Image = Annotated[str, Parameter(help="Image of the containers.")]
 Lease = Annotated[
     int, Parameter(help="`plane.lease_ms` of all: after so long silence a gateway counts as gone, milliseconds.")
 ]
+Secured = Annotated[bool, Parameter(help="With keys: TLS, roles and signatures on every link.")]
 
 bench_app = App(name="bench", help="Measure a promise beside its alternative, in one run.", group=TOOLS)
 

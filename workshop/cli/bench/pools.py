@@ -1,7 +1,9 @@
 """Measurements of the pool: starts, arrival rates, filling, moving, endurance, policies."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 from appliance.cli.common import Json
 from appliance.errors import Exit
@@ -9,7 +11,14 @@ from workshop.cli.bench.common import Floats, Image, Ints, Words, bench_app, mea
 
 
 @bench_app.command
-def startup(*, count: int = 100, cold: int = 5, image: Image = "base", ray: bool = True, as_json: Json = False) -> int:
+def startup(
+    *,
+    count: int = 100,
+    cold: int = 5,
+    image: Image = "base",
+    ray: Annotated[bool, Parameter(negative="--no-ray")] = True,
+    as_json: Json = False,
+) -> int:
     """Subtask startup: cold containers, warm local ones, warm ones of other gateways, Ray's actors, in one run.
 
     Args:
@@ -98,6 +107,31 @@ def zygote(
 
 
 @bench_app.command
+def training(
+    *,
+    clients: int = 16,
+    rounds: int = 40,
+    by: str = "dirichlet:0.5",
+    every: int = 10,
+    seed: int = 1,
+    as_json: Json = False,
+) -> int:
+    """What training in a warm container costs, and what rounds of it come to: clips, in virtual time.
+
+    Args:
+        clients: How many train in each round.
+        rounds: How many rounds.
+        by: How data are shared out: dirichlet:A, site, even.
+        every: Judge the model after so many rounds.
+        seed: Of the run and its data.
+    """
+    from workshop.bench.training import run
+
+    tell(measure(run("clips", clients, rounds, by=by, every=every, seed=seed, progress=say)), as_json=as_json)
+    return 0
+
+
+@bench_app.command
 def transfer(*, megabytes: int = 64, rounds: int = 3, as_json: Json = False) -> int:
     """How long a state volume takes from gateway to gateway, beside Podman's own export and import.
 
@@ -125,23 +159,22 @@ def migrate(
     part: Literal["all", "moves", "overload"] = "all",
     as_json: Json = False,
 ) -> int:
-    """How long moving a run to another gateway takes, beside starting it anew cold; and overload with and without.
+    """How long moving a run to another gateway takes, beside starting it again cold; and overload with and without.
 
     Args:
         moves: Moves with a checkpoint of 1 kB, and of 256 kB.
         volume_moves: Moves with a state volume.
         megabytes: Size of that volume.
-        cold: Runs that are ended and started anew.
+        cold: Runs that are ended and started again.
         runs: Runs that come to one gateway of four.
         work_s: What each of them works, seconds.
         long_s: What runs work that hold all containers of one gateway, seconds.
         short: Runs of a second that may run only there, and wait for those.
         part: Only the moves, or only the overload.
     """
-    from workshop.bench.migrate import run
-    from workshop.bench.overload import Options
+    from workshop.bench.migrate import Overload, run
 
-    load = Options(runs=runs, work_s=work_s, long_s=long_s, short=short)
+    load = Overload(runs=runs, work_s=work_s, long_s=long_s, short=short)
     tell(measure(run(moves, volume_moves, megabytes, cold, load=load, part=part, progress=say)), as_json=as_json)
     return 0
 

@@ -11,6 +11,40 @@ from appliance.errors import Exit
 from workshop.cli.bench.common import Ints, bench_app, measure, say, tell
 
 
+@bench_app.command(name="tui")
+def bench_tui(
+    *,
+    seconds: float = 60.0,
+    gateways: int = 100,
+    robots: int = 500,
+    tasks: int = 1000,
+    rate: int = 2000,
+    plain: Annotated[bool, Parameter(negative="--no-plain", help="Measure a plain table beside it.")] = True,
+    as_json: Json = False,
+) -> int:
+    """Key to paint, CPU and memory of the terminal UI on a large busy fleet, beside a plain table; exit 1 off target.
+
+    Args:
+        seconds: For how long each is measured; 600 shows whether memory stays flat.
+        gateways: Gateways of the fleet, all put by one process.
+        robots: Its robots.
+        tasks: Its tasks.
+        rate: Updates a second.
+        plain: Measure a plain table beside it.
+        as_json: Print JSON.
+    """
+    from workshop.bench.tui.run import run
+
+    result = measure(
+        run(seconds=seconds, gateways=gateways, robots=robots, tasks=tasks, rate=rate, plain=plain, progress=say)
+    )
+    tell(result, as_json=as_json)
+    ui, targets = result["ui"], result["targets"]
+    p95 = ui["key_to_paint_ms"]["p95"]
+    met = p95 is not None and p95 <= targets["key_to_paint_p95_ms"]
+    return Exit.DONE if met and ui["cpu_share_of_a_core"] <= targets["cpu_share_of_a_core"] else Exit.FAILED
+
+
 @bench_app.command
 def throughput(
     *,
@@ -19,8 +53,8 @@ def throughput(
     gateways: int = 4,
     containers: int = 3,
     kills: int = 5,
-    ray: bool = True,
-    profile: bool = True,
+    ray: Annotated[bool, Parameter(negative="--no-ray")] = True,
+    profile: Annotated[bool, Parameter(negative="--no-profile")] = True,
     as_json: Json = False,
 ) -> int:
     """Trivial subtasks a second through a fleet, where the time goes, and recovery from a killed worker; beside Ray.
@@ -79,19 +113,22 @@ def bench_plan(
     cases: Path | None = None,
     limit: int = 0,
     model: str = "",
+    rosters: bool = True,
     load: float = 0.0,
     seconds: float = 60.0,
     as_json: Json = False,
 ) -> int:
     """Plans: how good they are on a set of instructions with gold plans, and what escalating the unsure ones brings.
 
-    Without a local model the rules are measured, and routed on is their confidence. With --load one gateway is asked so
-    many times a second instead.
+    The same orders are given to fleets of 2 to 256 robots, too: `rosters` has a row for each size. Without a local
+    model the rules are measured, and routed on is their confidence. With --load one gateway is asked so many times a
+    second instead.
 
     Args:
         cases: JSONL file of cases with score.py beside it; by default the development set.
         limit: Use the first so many cases; 0 for all.
-        model: Folder of a local model.
+        model: Folder of a local model, or embedded.
+        rosters: Measure plans, confidence and time by the size of the fleet.
         load: Instructions a second for one gateway, instead of the cases.
         seconds: With --load: for how long.
     """
@@ -102,9 +139,11 @@ def bench_plan(
     else:
         from appliance.llm.settings import LlmConfig
         from workshop.bench.plan import run as bench
+        from workshop.bench.plan.rosters import SIZES
 
         config = LlmConfig(tiers=("local",), local_model=model) if model else None
-        result = measure(bench(cases, config=config, limit=limit, progress=console.err.print))
+        sizes = SIZES if rosters else ()
+        result = measure(bench(cases, config=config, limit=limit, sizes=sizes, progress=console.err.print))
     show(result, as_json=as_json, table=console.bench_table(result))
     return 0
 

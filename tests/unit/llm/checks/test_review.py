@@ -6,8 +6,10 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from appliance.llm import review as module
+from appliance.llm.checks.reading import spelled
 from appliance.llm.completion import completed
 from appliance.llm.review import CHECKS, Facts, review
 from appliance.llm.settings import PlanContext, SafetyConfig
@@ -64,6 +66,23 @@ GO2: Step = ("goto", "rover_1", {"place": "dock 2"})
         ("wait 30 seconds then go to dock 4",
          [("hold", "drone_1", {"duration_s": 30}), ("goto", "drone_1", {"place": "dock 4"})], "choose_robot", "hold"),
         ("Rover_1: get me a coffee", [("pick", "rover_1", {"object": "me coffee"})], "unknown_thing", "hold"),
+        ("Drone_1: take off and photograph the latter",
+         [("takeoff", "drone_1", {}), ("photograph", "drone_1", {"target": "latter"})], "names", "hold"),
+        ("Drone_1: photograph the green crate come Thursday",
+         [("photograph", "drone_1", {"target": "green crate come thursday"})], "names", "hold"),
+        ("Rover_1: pick up three hundred green crates at the shelf",
+         [("goto", "rover_1", {"place": "shelf"}), ("pick", "rover_1", {"object": "three hundred green crates"})],
+         "names", "hold"),
+        ("Drone_1: photograph the red box 1000 times",
+         [("photograph", "drone_1", {"target": "red box", "count": 1000})], "schema", "refuse"),
+        ("Drone_1: count the red boxes on the moored barge",
+         [("count", "drone_1", {"target": "red boxes", "area": "moored barge"})], "unknown_place", "hold"),
+        ("Rover_1: drive to goal 1 (28, 20)", [("goto", "rover_1", {"place": "goal 1"})], "names", "hold"),
+        ("Rover_1: drive to dock 1, forget I asked", [GO1], "correction", "hold"),
+        ("Rover_1 goes to dock 1 and at the same time drone_1 goes to dock 2",
+         [("goto", "drone_1", {"place": "dock 1"}), GO2], "assignment", "hold"),
+        ("First rover_1 goes to dock 2. Then drone_1 goes to dock 2 too",
+         [("goto", "drone_1", {"place": "dock 2"}), GO2], "sequence", "hold"),
         ("Rover_1: drive to dock 1, I mean dock 2", [GO2], "correction", "hold"),
         ("did rover_1 go to dock 1?", [GO1], "question", "hold"),
         ("Rover_1: take it there", [GO1], "pronoun", "hold"),
@@ -71,6 +90,36 @@ GO2: Step = ("goto", "rover_1", {"place": "dock 2"})
         ("Rover_1 goes to dock 1 and drone_1 to dock 2", [GO2], "idle_robot", "hold"),
         ("Rover_1: go to d\u043eck 1", [GO1], "unseen", "hold"),
         ("Rover_1: drive away from dock 1", [GO1], "polarity", "hold"),
+        ("Rover_1: bring three red boxes to dock 2",
+         [("goto", "rover_1", {"place": "dock 3"}), ("pick", "rover_1", {"object": "red boxes"}), GO2,
+          ("place", "rover_1", {"object": "red boxes", "at": "dock 2"})], "quantity", "hold"),
+        ("Rover_1: pick up all the red boxes at dock 3",
+         [("goto", "rover_1", {"place": "dock 3"}), ("pick", "rover_1", {"object": "red boxes"})], "quantity", "hold"),
+        ("Drone_1: track the driver for 90000 ms",
+         [("track", "drone_1", {"target": "driver", "window_ms": 90000})], "quantity", "hold"),
+        ("Rover_1: hold, spot go to dock 1", [("hold", "rover_1", {}), GO1], "coverage", "hold"),
+        ("Rover_1 is at dock 1, drone_1 takes off", [GO1, ("takeoff", "drone_1", {})], "coverage", "hold"),
+        ("Rover_1: take the green crate upside down to dock 2",
+         [("pick", "rover_1", {"object": "green crate upside"}), GO2,
+          ("place", "rover_1", {"object": "green crate upside", "at": "dock 2"})], "names", "hold"),
+        ("Rover_1: say good morning in the voice of my mother in law",
+         [("say", "rover_1", {"text": "good morning in the voice of my mother in law"})], "names", "hold"),
+        ("Rover_1 and drone_1 go to dock 1, then it photographs the truck",
+         [GO1, ("goto", "drone_1", {"place": "dock 1"}), ("photograph", "rover_1", {"target": "truck"})],
+         "pronoun", "hold"),
+        ("Rover_1: go to dock 3, pick up the red box and the green crate, go to dock 1 and put it down there",
+         [("goto", "rover_1", {"place": "dock 3"}), ("pick", "rover_1", {"object": "red box"}),
+          ("pick", "rover_1", {"object": "green crate"}), GO1,
+          ("place", "rover_1", {"object": "green crate", "at": "dock 1"})], "pronoun", "hold"),
+        ("Rover_1: when you have a moment go to dock 1",
+         [("wait_for", "rover_1", {"event": "you have a moment"}), GO1], "names", "hold"),
+        ("Send rover_1 to dock 1 and have it photograph dock 2 from there",
+         [GO1, GO2, ("photograph", "rover_1", {"target": "dock 2"})], "polarity", "hold"),
+        ("Drone_1 tracks rover_1, send rover_1 to dock 2",
+         [("track", "drone_1", {"target": "rover_1"}), ("goto", "drone_1", {"place": "dock 2"})], "assignment", "hold"),
+        ("Send rover_1 to dock 2 and have drone_1 photograph rover_1",
+         [("goto", "drone_1", {"place": "dock 2"}), ("photograph", "drone_1", {"target": "rover_1"})],
+         "idle_robot", "hold"),
     ],
 )  # fmt: skip
 def test_each_kind_is_found_by_the_check_of_its_name(
@@ -95,6 +144,14 @@ def test_each_kind_is_found_by_the_check_of_its_name(
          [("wait_for", "rover_1", {"event": "eva confirms"}), GO1]),
         ("Drone_1: take off to 30 feet", [("takeoff", "drone_1", {"altitude_m": 9.144})]),
         ("Rover_1: go to (26, 6)", [("goto", "rover_1", {"place": "26, 6"})]),
+        ("Send rover_1 to dock 1 and have it photograph dock 2 from there",
+         [GO1, ("photograph", "rover_1", {"target": "dock 2"})]),
+        ("pls rover_1 go @ dock 1 :)", [GO1]),
+        ("rover_1 pls photograph the shelf x3", [("photograph", "rover_1", {"target": "shelf", "count": 3})]),
+        ("Drone_1: track rover_1", [("track", "drone_1", {"target": "rover_1"})]),
+        ("Drone_1 tracks rover_1, send rover_1 to dock 2", [("track", "drone_1", {"target": "rover_1"}), GO2]),
+        ("Drone_1: take a photo of rover_1", [("photograph", "drone_1", {"target": "rover_1"})]),
+        ("Rover_1: go to dock 1, then dock 2. That's all, over and out", [GO1, GO2]),
         ("Rover_1: photograph the stop sign", [("photograph", "rover_1", {"target": "stop sign"})]),
     ],
 )  # fmt: skip
@@ -159,3 +216,83 @@ def test_checks_have_names_and_survive_hostile_plans() -> None:
         assert review(made).decision is Verdict.REFUSE
         for check in CHECKS:
             list(check.run(made))
+
+
+@pytest.mark.parametrize("said", ["all five drones", "both drones", "all 3 drones"])
+def test_a_group_of_another_size_is_asked_about(said: str) -> None:
+    """Who says "all five drones" of a fleet with one is asked: the words are of another fleet."""
+    found = review(facts(f"{said}: land", ("land", "drone_1", {})))
+    assert found.decision is Verdict.HOLD
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("rover_1 & rover_2 @ dock 1 :)", "rover_1 and rover_2 at dock 1"),
+        ("photo of the shelf x3, then home", "photo of the shelf 3 times, then home"),
+        ("go to x 5, y 3", "go to x 5, y 3"),
+        ("all of u n them", "all of you and them"),
+        ('say "me & u x3"', 'say "me & u x3"'),
+        ("say 'me & u x3', then go @ home", "say 'me & u x3', then go at home"),
+        ("say “me & u :)”", "say “me & u :)”"),
+        ('say "me & u', 'say "me and you'),
+        ("go to R&D", "go to R&D"),
+    ],
+)
+def test_shorthand_is_read_as_what_it_is_short_for(typed: str, meant: str) -> None:
+    """Signs of chat become words, but not in quotation marks, in names and between coordinates."""
+    assert spelled(typed) == meant
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("u goes to dock 1", "u goes to dock 1"),
+        ("U and u_1: land, both of you", "U and u_1: land, both of you"),
+        ("unit n 1 & rover_x2 go home", "unit n 1 and rover_x2 go home"),
+        ("unit_n then u", "unit_n then u"),
+        ("go to bay x3", "go to bay x3"),
+        ("go to bay x3, photo of it x3", "go to bay x3, photo of it 3 times"),
+        ("thats to Bay  X3", "thats to Bay  X3"),
+        ("load & go & ship", "load & go and ship"),
+    ],
+)
+def test_names_are_no_shorthand(typed: str, meant: str) -> None:
+    """A robot called `u`, a place called "bay x3": names of the fleet and of the site stay as they are."""
+    known = ("u", "u_1", "unit_n", "unit_n_1", "rover_x2", "thats", "bay x3", "load & go")
+    assert spelled(typed, known) == meant
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "Rover_1 goes to dock 1, after that drone_1 takes off",
+        "Rover_1 goes to dock 1. When it's done, drone_1 takes off",
+        "Rover_1 goes to dock 1. As soon as it is there, drone_1 takes off",
+        "Rover_1 goes to dock 1. When you've arrived, drone_1 takes off",
+    ],
+)
+def test_what_is_first_by_a_clause_without_content_is_first(said: str) -> None:
+    """Such a clause orders what comes before and behind it: a plan that does both side by side is held."""
+    subtasks = (
+        Subtask(id="s1", skill="goto", robot="rover_1", params={"place": "dock 1"}),
+        Subtask(id="s2", skill="takeoff", robot="drone_1", params={}),
+    )
+    context = PlanContext(instruction=said, robots=roster("demo"), site=SITE)
+    for after, held in (((), True), (("s1",), False)):
+        plan = Plan(domain="navigation", subtasks=(subtasks[0], replace(subtasks[1], after=after)))
+        found = review(Facts(plan, context, CATALOGUE, SafetyConfig()))
+        assert ("sequence" in {each.check for each in found.findings}) is held
+
+
+def test_a_clause_with_content_is_first_itself() -> None:
+    """Of "return home once you have photographed the shelf" the photograph comes first, and nothing is to be asked."""
+    text = "Rover_1: return home once you have photographed the shelf"
+    steps: list[Step] = [("photograph", "rover_1", {"target": "shelf"}), ("return_home", "rover_1", {})]
+    assert review(facts(text, *steps)).decision is Verdict.RUN
+
+
+def test_in_the_meantime_is_side_by_side() -> None:
+    """As "meanwhile" is."""
+    text = "Rover_1 goes to dock 1, drone_1 in the meantime takes off"
+    assert "sequence" in {each.check for each in review(facts(text, GO1, ("takeoff", "drone_1", {}))).findings}

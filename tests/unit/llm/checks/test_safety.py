@@ -337,7 +337,7 @@ def test_names_of_one_place_ground_each_other(site: Site, robots: tuple[RobotInf
 
 
 def test_why_an_operator_should_look_first(catalogue: Catalogue) -> None:
-    """A skill that the policy names holds a plan, whoever wrote it; otherwise nothing does."""
+    """A skill that the policy names holds any plan; otherwise nothing does."""
     cut = plan(step("s1", "cut", object="rope"))
     asked = PlanContext(instruction="cut the rope")
     config = SafetyConfig(confirm_skills=("cu*",))

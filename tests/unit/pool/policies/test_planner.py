@@ -1,6 +1,7 @@
 """The planner: what it orders is within bounds, spares what it must, and does not contradict itself."""
 
 from collections import Counter
+from typing import get_args, get_type_hints
 
 import msgspec
 import pytest
@@ -10,7 +11,7 @@ from msgspec.structs import replace
 
 from appliance.model import PoolHint
 from appliance.pool.policies import ColdCosts, Idle, Planner, View
-from appliance.pool.policies.eviction import GreedyDual
+from appliance.pool.policies.eviction import EVICTION, KEEPING, GreedyDual
 from appliance.pool.policies.forecast import OPERATOR
 from appliance.pool.policies.planner import PlannerState, missing, victims
 from appliance.pool.settings import PoolConfig
@@ -307,3 +308,10 @@ def test_an_operators_wish_is_met_whatever_is_set() -> None:
     (start,), _ = planner.tend(empty, 1.0)
     assert start.image == "base"
     assert planner.tend(empty, 61.0) == ((), ())
+
+
+def test_the_tables_of_policies_have_what_the_settings_name() -> None:
+    """Each name in `pool.eviction` and `pool.keep` has its policy, and there is no other."""
+    hints = get_type_hints(PoolConfig)
+    assert set(EVICTION) == set(get_args(hints["eviction"]))
+    assert set(KEEPING) == set(get_args(hints["keep"]))

@@ -1,4 +1,4 @@
-"""A gateway alone with robots that hold when they are told, in memory."""
+"""A gateway alone with robots that hold on command, in memory."""
 
 import asyncio
 from types import SimpleNamespace
@@ -8,13 +8,13 @@ import msgspec
 import pytest
 
 from appliance.errors import UnreachableError
-from appliance.model import RobotCommand, RobotInfo, RobotReply, VersionVector, encode
+from appliance.model import RobotCommand, RobotInfo, RobotReply, VersionVector, encode, keyspace
+from appliance.model.keys import Keys, Topic
 from appliance.plane.dht import Record
-from appliance.plane.keys import Keys
 
 
 class FakePlane:
-    """A gateway alone with robots that hold when they are told; those in `deaf` cannot be reached."""
+    """A gateway alone with robots that hold on command; those in `deaf` cannot be reached."""
 
     gateway = "gw-1"
 
@@ -22,10 +22,11 @@ class FakePlane:
         self.keys = Keys("f")
         self.session = self.dht = self.store = self
         self.registry = SimpleNamespace(robots={}, doubtful=lambda _: False)
+        self.credentials: Any = None
         self.told: list[str] = []
         self.deaf: set[str] = set()
         self.mad: dict[str, bytes] = {}
-        """Robots that answer with these bytes, whatever they are told."""
+        """Robots that answer with these bytes, to every command."""
         self.values: dict[str, bytes] = {}
         self.puts: list[str] = []
         self.records: dict[str, Record] = {}
@@ -59,6 +60,10 @@ class FakePlane:
         """Hear nothing."""
         return SimpleNamespace(close=lambda: None)
 
+    def publish(self, topic: Topic[Any], value: Any, *names: str) -> None:
+        """Put a fact."""
+        self.put(self.keys(topic, *names), encode(value))
+
     def put(self, key: str, payload: bytes) -> Any:
         """Keep it: what is put on the store is awaited, what is put on a key is not."""
         self.puts.append(key)
@@ -71,9 +76,9 @@ class FakePlane:
         """Return what is kept."""
         return [(key, value) for key, value in self.values.items() if key.startswith(prefix)]
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:  # noqa: ARG002 - as a session
+    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool) -> bytes:  # noqa: ARG002 - as a session
         """Do it, or hold."""
-        robot = next(each for each in self.registry.robots if self.keys.command(each) == key)
+        robot = next(each for each in self.registry.robots if self.keys(keyspace.COMMAND, each) == key)
         if robot in self.deaf:
             raise UnreachableError(f"{robot} is not reached")
         if robot in self.mad:

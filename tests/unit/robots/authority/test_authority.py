@@ -1,11 +1,13 @@
-"""Commands to a robot that is stopped or taken over: refused by whoever carries them out, waited for by handlers."""
+"""Commands to a robot that is stopped or taken over: refused by its executor, waited for by handlers."""
 
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from appliance.model import Lease, RobotCommand, SoftStop
+from appliance.model import Lease, RobotCommand, RobotInfo, SoftStop, keyspace
+from appliance.model.robot_api import StopAnswer, StopAsk
+from appliance.model.steering import MAX_STOPPED
 from appliance.robots.authority.authority import Authority
 from appliance.robots.authority.lease import Leases
 from appliance.robots.authority.soft_stop import Stops
@@ -29,6 +31,7 @@ def known() -> Known:
 def authority(known: Known) -> Authority:
     """Return an authority that knows what the test says."""
     it = cast("Any", Authority.__new__(Authority))
+    it._out_of_use = lambda _: ""  # pyright: ignore[reportUnknownLambdaType]
     it._stopping = it._leasing = known
     it._plane = SimpleNamespace(registry=SimpleNamespace(robots={}))
     return cast("Authority", it)
@@ -50,7 +53,7 @@ def test_a_stopped_robot_is_given_nothing_that_moves_it(authority: Authority, kn
 
 
 def test_only_commands_with_the_lease_move_a_robot_that_was_taken_over(authority: Authority, known: Known) -> None:
-    """Others are told who has it; a soft stop counts for the one who has it as well."""
+    """Others hear who has it; a soft stop counts for the one who has it as well."""
     known.leases.hear(Lease(id="l", robot="r1", by="ann"), 0.0)
     assert authority.refuses("r1", order()) == "taken over by ann"
     assert authority.refuses("r1", order(lease="other")) == "taken over by ann"
@@ -75,3 +78,47 @@ def test_a_lease_that_is_over_moves_nothing_and_frees_nothing(authority: Authori
     assert authority.refuses("r1", order(lease="l")) == "no longer under that lease"
     assert authority.refuses("r1", order()) == "taken over by ann"
     assert authority.hindrance("r1") == "taken over by ann"
+
+
+class Stopper:
+    """A gateway that takes soft stops, and the robots that it sees online."""
+
+    gateway = "gw-1"
+
+    def __init__(self, *online: str) -> None:
+        robots = {name: RobotInfo(id=name, kind="zenoh", gateway="gw-1", online=True) for name in online}
+        self.registry = SimpleNamespace(robots=robots)
+        self.session = SimpleNamespace(credentials=SimpleNamespace(roster=SimpleNamespace(number=7)))
+        self.rpc = self
+        self.asks: list[StopAsk] = []
+
+    async def call(self, gateway: str, verb: object, ask: StopAsk) -> StopAnswer:
+        """Take a stop; all of its robots hold."""
+        assert (gateway, verb) == ("gw-1", keyspace.SOFT_STOP)
+        self.asks.append(ask)
+        return StopAnswer(stops=(), gateways=(gateway,), robots=ask.robots)
+
+    async def revoke(self, *robots: str) -> dict[str, tuple[str, ...]]:
+        """Have these robots stopped; returns the stops, by id."""
+        it = cast("Any", Authority.__new__(Authority))
+        it._plane = self
+        await cast("Authority", it).hold_revoked(frozenset(robots))
+        return {ask.act: ask.robots for ask in self.asks}
+
+
+@pytest.mark.anyio
+async def test_all_robots_that_are_revoked_at_once_are_stopped() -> None:
+    """Also more than one stop can name."""
+    names = [f"r{number:04}" for number in range(2 * MAX_STOPPED + 1)]
+    stops = await Stopper(*names).revoke(*names)
+    assert sorted(name for robots in stops.values() for name in robots) == names
+    assert max(map(len, stops.values())) == MAX_STOPPED
+
+
+@pytest.mark.anyio
+async def test_a_stop_of_revoked_robots_has_the_id_of_no_stop_of_others() -> None:
+    """Gateways that see the same robots online make one stop; one that sees another robot loses nothing by it."""
+    one, same = await Stopper("r1").revoke("r1", "r2"), await Stopper("r1").revoke("r1", "r2")
+    more = await Stopper("r1", "r2").revoke("r1", "r2")
+    assert one == same
+    assert one.keys().isdisjoint(more)

@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 from appliance.errors import ConflictError, RefusedError, UnreachableError
-from appliance.model import Lease, RobotCommand, encode
+from appliance.model import Lease, RobotCommand, encode, keyspace
+from appliance.model.robot_api import DriveAsk, RenewAsk, TakeAsk
 from appliance.plane.dht import Record
-from appliance.robots.api import DriveAsk, RenewAsk, TakeAsk
 from appliance.robots.authority import lease as module
 from appliance.robots.authority.lease import Leasing
 from tests.unit.robots.authority.conftest import FakePlane
@@ -46,7 +46,7 @@ async def leasing(plane: FakePlane, gate: Gate) -> AsyncIterator[Leasing]:
 
 
 async def test_a_soft_stop_binds_whoever_has_the_robot(plane: FakePlane, leasing: Leasing, gate: Gate) -> None:
-    """A robot that cannot refuse by itself is sent nothing by the gateway that is asked; the reason is told."""
+    """A robot that cannot refuse by itself is sent nothing by the gateway that is asked; the reason is reported."""
     lease = await leasing.take(TakeAsk(robot="r1", by="ann"))
     ask = DriveAsk(robot="r1", lease=lease.id, verb="velocity", args={"forward_mps": 1.0})
     await leasing.move(ask)
@@ -58,7 +58,7 @@ async def test_a_soft_stop_binds_whoever_has_the_robot(plane: FakePlane, leasing
 
 
 async def test_what_an_operator_orders_is_held_to_the_robots_limits(plane: FakePlane) -> None:
-    """What is above a limit is not sent, and the reason is told."""
+    """What is above a limit is not sent, and the reason is reported."""
     plane.robot("r1")
 
     def orders(robot: str, command: RobotCommand) -> RobotCommand:
@@ -96,13 +96,13 @@ def over(leasing: Leasing, ago_s: float = 0.0) -> Lease:
 async def test_a_robot_holds_before_its_tasks_have_it_again(
     plane: FakePlane, leasing: Leasing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Until it has answered that it holds the lease stands, and cannot be renewed; then its end is told."""
+    """Until it has answered that it holds the lease stands, and cannot be renewed; then its end is seen."""
     holds = asyncio.Event()
     query = plane.query
 
-    async def slow(key: str, payload: bytes, *, timeout_s: float) -> bytes:
+    async def slow(key: str, payload: bytes, *, timeout_s: float, sign: bool) -> bytes:
         await holds.wait()
-        return await query(key, payload, timeout_s=timeout_s)
+        return await query(key, payload, timeout_s=timeout_s, sign=sign)
 
     monkeypatch.setattr(plane, "query", slow)
     lease = over(leasing)
@@ -114,7 +114,7 @@ async def test_a_robot_holds_before_its_tasks_have_it_again(
     holds.set()
     await until(lambda: leasing.leases.of("r1") is None)
     assert plane.told == ["r1"]
-    await until(lambda: plane.puts == [plane.keys.lease("r1")])
+    await until(lambda: plane.puts == [plane.keys(keyspace.LEASE, "r1")])
 
 
 async def test_where_nobody_tells_its_end_a_lease_ends_after_the_grace(plane: FakePlane, leasing: Leasing) -> None:
@@ -148,7 +148,7 @@ async def test_what_breaks_does_not_keep_leases_from_ending(plane: FakePlane, le
 async def test_a_robot_is_taken_over_though_nobody_knows_whether_somebody_has_it(
     plane: FakePlane, leasing: Leasing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever holds the record is away: the robot is had all the same, and a lease that turns up there is heeded."""
+    """The holder of the record is away: the robot is had all the same, and a lease that turns up there is heeded."""
     reads: list[str] = []
     read = plane.read
 

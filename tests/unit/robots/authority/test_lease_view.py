@@ -59,7 +59,7 @@ def test_another_lease_does_not_take_a_robot_that_is_held() -> None:
 
 
 def test_an_end_frees_the_robot_for_the_next() -> None:
-    """Whoever comes after has it; the end of another lease changes nothing."""
+    """The next operator has it; the end of another lease changes nothing."""
     it = Leases()
     it.hear(lease("a"), 0.0)
     assert not it.hear(lease("x", ended="given back"), 1.0)

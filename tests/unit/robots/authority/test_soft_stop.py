@@ -1,13 +1,14 @@
-"""Soft stops on one gateway: robots and gateways that were away are told to hold as long as the stop is in force."""
+"""Soft stops on one gateway: robots and gateways that were away hold as soon as they are back, while it is in force."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
 from appliance.model import SoftStop, encode
-from appliance.robots.api import ResumeRobotsAsk, StandingAsk, StopAsk
+from appliance.model.robot_api import ResumeRobotsAsk, StandingAsk, StopAsk
 from appliance.robots.authority import soft_stop
 from appliance.robots.authority.soft_stop import MOST, RESERVE, STORED, Stopping
 from tests.unit.robots.authority.conftest import FakePlane
@@ -64,8 +65,31 @@ async def test_a_robot_that_was_away_is_told_when_it_comes(plane: FakePlane, kno
     assert "r3" not in plane.told
 
 
+async def test_a_robot_whose_certificate_is_revoked_is_told_to_hold(plane: FakePlane, known: Stopping) -> None:
+    """It counts as offline, and may be linked and moving: it gets the stop, and that it holds is not believed."""
+    await known.start()
+    plane.credentials = SimpleNamespace(barred=frozenset({"r1", "r2"}))
+    plane.robot("r1", online=False)
+    plane.robot("r2", online=False)
+    plane.deaf = {"r2"}
+    answer = await known.stop(StopAsk(by="ann"))
+    assert "r1" in plane.told
+    assert answer.robots == ()
+    assert "revoked" in answer.problems["r1"]
+    assert "offline" in answer.problems["r2"]
+
+
+async def test_a_stop_that_was_only_published_reaches_a_revoked_robot(plane: FakePlane, known: Stopping) -> None:
+    """The gateway that owns its key tells it."""
+    await known.start()
+    plane.credentials = SimpleNamespace(barred=frozenset({"r1"}))
+    plane.robot("r1", online=False, gateway="")
+    await known.merge((SoftStop(id="s1", by="ann"),), ())
+    await until(lambda: plane.told == ["r1"])
+
+
 async def test_a_robot_that_nobody_knows_is_told_when_it_comes(plane: FakePlane, known: Stopping) -> None:
-    """Named in a stop, it is a problem of the answer, and no success; when it comes it is told."""
+    """Named in a stop, it is a problem of the answer, and no success; when it comes it gets the stop."""
     await known.start()
     answer = await known.stop(StopAsk(by="ann", robots=("r1",)))
     assert answer.robots == ()
@@ -93,7 +117,7 @@ async def test_a_robot_that_does_not_confirm_is_told_on(plane: FakePlane, known:
 async def test_a_robot_that_answers_with_anything_keeps_no_other_from_holding(
     told: bytes, plane: FakePlane, known: Stopping
 ) -> None:
-    """Its answer is told as the problem that it is; the others hold, and it is told on."""
+    """Its answer is reported as the problem that it is; the others hold, and it gets the stop again."""
     await known.start()
     plane.robot("r1")
     plane.robot("r2")
@@ -120,7 +144,7 @@ async def test_a_gateway_that_returns_has_its_robots_hold(plane: FakePlane, know
 
 
 async def test_the_fleet_is_stopped_whatever_is_in_force(plane: FakePlane, known: Stopping) -> None:
-    """By the reserve for such stops; and when that is used up, it is stopped already and its robots are told again."""
+    """By the reserve for such stops; and when that is used up, it is stopped already and its robots get it again."""
     await known.start()
     many = [SoftStop(id=f"s{number}", robots=(f"x{number}",)) for number in range(MOST - RESERVE)]
     known.stops.merge(many, ())
@@ -130,6 +154,18 @@ async def test_the_fleet_is_stopped_whatever_is_in_force(plane: FakePlane, known
         assert (await known.stop(StopAsk(by="ann"))).robots == ("r1",)
         assert "r1" in plane.told
     assert len(known.stops.stops) == MOST
+
+
+async def test_a_stop_of_the_fleet_stays_when_others_lift_theirs(plane: FakePlane, known: Stopping) -> None:
+    """With as many stops in force as are kept, another operator's is kept besides; theirs are lifted, it stays."""
+    await known.start()
+    theirs = [SoftStop(id=f"s{number}", by="ann") for number in range(MOST)]
+    known.stops.merge(theirs, ())
+    plane.robot("r1")
+    answer = await known.stop(StopAsk(by="bob", act="mine"))
+    assert "mine" in {each.id for each in answer.stops}
+    await known.resume(ResumeRobotsAsk(by="ann", act="r", stops=tuple(each.id for each in theirs)), nothing)
+    assert [each.id for each in known.stops.active] == ["mine"]
 
 
 async def test_only_what_the_operator_has_seen_is_lifted(known: Stopping) -> None:

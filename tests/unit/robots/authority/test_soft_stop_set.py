@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.model import Lifted, SoftStop
-from appliance.robots.authority.soft_stop import MOST, RESERVE, Stops
+from appliance.robots.authority.soft_stop import MOST, MOST_OPERATORS, RESERVE, Stops
 
 ROBOTS = ("r1", "r2", "r3")
 some = st.sets(st.sampled_from(ROBOTS), max_size=2).map(lambda found: tuple(sorted(found)))
@@ -133,6 +133,21 @@ def test_the_fleet_can_be_stopped_however_many_robots_are() -> None:
     it.add(fleet)
     assert it.whole == fleet
     assert len(it.active) == number + 1
+
+
+def test_each_operator_has_room_for_one_more_stop_of_the_fleet() -> None:
+    """Beyond what is kept one of each operator is, for a bounded number of them; none in force is forgotten."""
+    it = Stops()
+    for number in range(MOST):
+        it.add(SoftStop(id=f"s{number}", by="ann"))
+    assert not it.room(SoftStop(id="again", by="ann"))
+    for number in range(MOST_OPERATORS):
+        stop = SoftStop(id=f"o{number}", by=f"operator {number}")
+        assert it.room(stop)
+        it.add(stop)
+        assert not it.room(SoftStop(id=f"p{number}", by=f"operator {number}"))
+    assert not it.room(SoftStop(id="one more", by="one more"))
+    assert len(it.active) == MOST + MOST_OPERATORS
 
 
 @given(st.lists(st.one_of(stops, lifts), max_size=10).map(unique))

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need
-from appliance.tasks.api import Weighed
+from appliance.model.task_api import Weighed
 from appliance.tasks.migration.policy import History, Place, closest
 from appliance.tasks.settings import MigrationConfig
 

@@ -9,8 +9,8 @@ import pytest
 
 from appliance.errors import PayloadError, RefusedError, SwiftbotError
 from appliance.model import Need, RunRequest
-from appliance.tasks.api import DrainAsk, DrainStateAsk, Reason, RunAsk, RunStatus, UndrainAsk
-from appliance.tasks.executor import Here
+from appliance.model.task_api import DrainAsk, DrainStateAsk, Reason, RunAsk, RunStatus, UndrainAsk
+from appliance.tasks.handoff import Here
 from appliance.tasks.migration import gateway as module
 from appliance.tasks.migration.gateway import Draining
 from appliance.tasks.settings import MigrationConfig
@@ -38,7 +38,7 @@ class Gateway:
         self.it = Draining(
             "gw-1",
             executor=cast("Any", self),
-            leaving=cast("Any", self),
+            source=cast("Any", self),
             requesting=cast("Any", self),
             config=MigrationConfig(),
             on_change=lambda: None,

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -26,7 +26,7 @@ from appliance.model import (
     SubtaskState,
     TaskState,
 )
-from appliance.tasks.api import Held, MigrateAsk, Migrated, MoveAsk, Reserved, RunStatus
+from appliance.model.task_api import Held, MigrateAsk, Migrated, MoveAsk, Reserved, RunStatus
 from appliance.tasks.migration import moving as module
 from appliance.tasks.migration.moving import Moving
 from appliance.tasks.settings import MigrationConfig
@@ -51,10 +51,12 @@ class Fleet:
             plane.registry.containers[name] = {info.id: info}
         for verb in ("run_reserve", "run_unreserve", "run_hold", "run_resume", "run_leave", "run_status"):
             plane.rpc.on[verb] = self._answer(verb)
-        tasks = type(
-            "T", (), {"driver": lambda _, __: bench.driver, "manifest": lambda _, s: bench.around.manifest(s)}
-        )()
-        self.moving = Moving(plane, cast("Any", tasks), MigrationConfig(cpu_high=0.0))
+        self.moving = Moving(
+            plane,
+            coordinator=lambda _: bench.coordinator,
+            manifest=bench.context.manifest,
+            config=MigrationConfig(cpu_high=0.0),
+        )
 
     def _answer(self, verb: str) -> Any:
         async def answer(gateway: str, ask: Any) -> Any:
@@ -83,7 +85,7 @@ async def fleet(bench: Any, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Fl
     """A subtask that runs on gw-1, and what could be done about it."""
     monkeypatch.setattr(module, "WRITE_S", 20.0)
     monkeypatch.setattr(module, "START_S", 20.0)
-    monkeypatch.setattr(module, "DRIVER_S", 0.05)
+    monkeypatch.setattr(module, "COORDINATOR_S", 0.05)
     await bench.start()
     _, request = await bench.ordered()
     bench.tell(request, RunEventKind.STARTED)
@@ -134,7 +136,7 @@ async def test_what_fails_before_the_record_is_written_leaves_the_run_where_it_w
     fleet.problems[verb] = problem
     with pytest.raises(SwiftbotError):
         await fleet.moving.migrate(ASK)
-    record = fleet.bench.driver.record
+    record = fleet.bench.coordinator.record
     assert (record.subtasks[0].attempt, record.subtasks[0].gateway) == (1, "gw-1")
     assert not fleet.did("run_leave")
     if verb == "run_hold":
@@ -167,7 +169,7 @@ async def test_a_record_that_cannot_be_written_leaves_the_run_where_it_was(fleet
         await fleet.moving.migrate(ASK)
     assert not fleet.did("run_leave")
     assert fleet.did("run_resume") == ["gw-1"]
-    assert fleet.bench.around.orders.empty()
+    assert fleet.bench.context.orders.empty()
     assert fleet.bench.stored().subtasks[0].attempt == 1
 
 
@@ -201,7 +203,7 @@ async def test_an_order_that_fails_after_the_record_is_written_is_repeated_at_no
     fleet: Fleet, problem: SwiftbotError
 ) -> None:
     """As one that was lost with its gateway: under a higher number, and the skill's retries are untouched."""
-    fleet.bench.around.refusals = [problem]
+    fleet.bench.context.refusals = [problem]
     moving = asyncio.create_task(fleet.moving.migrate(ASK))
     await fleet.bench.ordered()
     moved = await moving
@@ -252,7 +254,7 @@ async def test_a_move_can_be_called_off_until_its_record_is_written(fleet: Fleet
     async with asyncio.timeout(60):
         while not (fleet.did("run_resume") and fleet.did("run_unreserve")):
             await asyncio.sleep(0.005)
-    assert fleet.bench.driver.record.subtasks[0].attempt == 1
+    assert fleet.bench.coordinator.record.subtasks[0].attempt == 1
     assert not (await fleet.moving.cancel(MoveAsk(task="t-1", subtask="s1"))).cancelled
     await _ends_where_it_was(fleet)
 
@@ -272,12 +274,12 @@ async def test_one_move_of_a_subtask_at_a_time(fleet: Fleet) -> None:
 
 async def test_a_run_that_commands_a_robot_stays_unless_its_manifest_says_otherwise(fleet: Fleet) -> None:
     """By default such a skill never moves once it has begun."""
-    work = fleet.bench.around.skills["work"]
-    fleet.bench.around.skills["work"] = replace(work, runs="robot", verbs=("goto",))
+    work = fleet.bench.context.skills["work"]
+    fleet.bench.context.skills["work"] = replace(work, runs="robot", verbs=("goto",))
     with pytest.raises(RefusedError, match="commands a robot"):
         await fleet.moving.migrate(ASK)
     assert not [verb for verb, _ in fleet.asked if verb != "run_status"]  # the driver itself may have asked that
-    fleet.bench.around.skills["work"] = replace(work, runs="robot", verbs=("goto",), migratable="between commands")
+    fleet.bench.context.skills["work"] = replace(work, runs="robot", verbs=("goto",), migratable="between commands")
     moving = asyncio.create_task(fleet.moving.migrate(ASK))
     await start_there(fleet)
     assert isinstance(await moving, Migrated)

@@ -6,6 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.model import Failure, Plan, RobotInfo, Subtask, SubtaskState, TaskRecord
+from appliance.model.transitions import Transition, TransitionKind
 from appliance.skills.catalogue import SkillManifest, load_catalogue
 from appliance.tasks import machine
 from appliance.tasks.replan import (
@@ -24,7 +25,6 @@ from appliance.tasks.replan import (
     splice,
 )
 from appliance.tasks.settings import ReplanConfig
-from appliance.tasks.transition import Transition, TransitionKind
 
 SKILLS = load_catalogue().skills
 CONFIG = ReplanConfig()
@@ -211,7 +211,7 @@ def test_the_order_of_what_is_tried() -> None:
 
 
 def test_what_the_policy_forbids_is_not_tried() -> None:
-    """A robot that may not take over gives way to one that may, a skill to the next option; why is told."""
+    """A robot that may not take over gives way to one that may, a skill to the next option; why is reported."""
     record = given_up((GOTO, PHOTO), "s2", OFFLINE)
     three = Robots(roster={**ROBOTS.roster, "rover_3": rover("rover_3")})
     given: dict[str, Any] = {"manifests": SKILLS, "robots": three, "config": CONFIG}

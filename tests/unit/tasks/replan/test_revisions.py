@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.model import Decision, Failure, Plan, RobotInfo, Subtask, SubtaskState, TaskRecord, TaskState, encode
+from appliance.model.transitions import StaleTransitionError, Transition, TransitionKind
 from appliance.skills.catalogue import Alternative, SkillManifest
 from appliance.tasks import machine
 from appliance.tasks.replan import Rebinding, Robots, Substitution, alternative_skill, another_robot, problems, splice
 from appliance.tasks.settings import ReplanConfig
-from appliance.tasks.transition import StaleTransitionError, Transition, TransitionKind
 
 SKILLS = {
     name: SkillManifest(

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 
 from appliance.errors import ConflictError, PayloadError
-from appliance.model import Act, TaskRecord, TaskRequest, encode
-from appliance.pool.transfer.protocol import FetchAsk
-from appliance.robots.api import StopAsk
-from appliance.tasks.api import ActsAsk, PauseAsk, RetryAsk
+from appliance.model import Act, TaskRecord, TaskRequest, keyspace
+from appliance.model.robot_api import StopAsk
+from appliance.model.task_api import ActsAsk, PauseAsk, RetryAsk
+from appliance.model.transfer_api import FetchAsk
 from appliance.tasks.audit import KEPT, Audit, target_of
 
 pytestmark = pytest.mark.anyio
@@ -39,7 +39,7 @@ async def test_what_came_of_an_order_is_put(plane: Any) -> None:
         await audit.signed("pause", broken)(PauseAsk(id="t-1"))
     await audit.signed("pause", done)(PauseAsk(id="t-1", by="ann", here=True))
     await audit.signed("pause", done, when=lambda _: False)(PauseAsk(id="t-1", by="ann"))
-    told = plane.session.sent(plane.keys.act("gw-1"), Act)
+    told = plane.session.sent(plane.keys(keyspace.ACT, "gw-1"), Act)
     assert [(each.by, each.target, each.outcome) for each in told] == [
         ("ann", "t-1", "done"),
         ("bob", "t-1", "conflict"),
@@ -55,11 +55,11 @@ async def test_orders_given_to_other_gateways_are_remembered(plane: Any) -> None
     """One that dies takes none along; one that says it is another's is not believed; the number is bounded."""
     audit = Audit(plane.session, plane.keys, "gw-1")
     audit.listen()
-    plane.session.put(plane.keys.act("gw-2"), encode(Act(id="a", verb="stop", by="ann", gateway="gw-2")))
-    plane.session.put(plane.keys.act("gw-3"), encode(Act(id="b", verb="stop", by="eve", gateway="gw-2")))
+    plane.session.publish(keyspace.ACT, Act(id="a", verb="stop", by="ann", gateway="gw-2"), "gw-2")
+    plane.session.publish(keyspace.ACT, Act(id="b", verb="stop", by="eve", gateway="gw-2"), "gw-3")
     assert [each.id for each in (await audit.acts(ActsAsk())).acts] == ["a"]
     for number in range(KEPT + 10):
-        plane.session.put(plane.keys.act("gw-2"), encode(Act(id=f"n{number}", verb="x", by="ann", gateway="gw-2")))
+        plane.session.publish(keyspace.ACT, Act(id=f"n{number}", verb="x", by="ann", gateway="gw-2"), "gw-2")
     assert len((await audit.acts(ActsAsk(limit=10_000))).acts) == KEPT
 
 
@@ -77,7 +77,10 @@ async def test_submissions_are_audited_apart(plane: Any) -> None:
     await submit(TaskRequest(instruction="go", id="t-2", submitter="bob"))
     with pytest.raises(PayloadError):
         await submit(TaskRequest(instruction=""))
-    told = [(each.verb, each.by, each.target, each.outcome) for each in plane.session.sent(plane.keys.act("gw-1"), Act)]
+    told = [
+        (each.verb, each.by, each.target, each.outcome)
+        for each in plane.session.sent(plane.keys(keyspace.ACT, "gw-1"), Act)
+    ]
     assert told[1:] == [("submit", "bob", "t-2", "done"), ("submit", "unsigned", "a new task", "payload")]
     for number in range(KEPT + 10):
         await submit(TaskRequest(instruction="go", id=f"t-{number}"))

@@ -21,8 +21,8 @@ from appliance.model import (
     TaskState,
     Tier,
 )
+from appliance.model.task_api import ApproveAsk, PauseAsk, ResumeAsk, RetryAsk
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.api import ApproveAsk, PauseAsk, ResumeAsk, RetryAsk
 from appliance.tasks.machine import matches, plan_hash
 from appliance.tasks.steering import may_pause, may_resume, may_retry, needed_robots, needs_approval, proposal_for
 

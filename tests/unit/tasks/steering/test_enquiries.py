@@ -6,9 +6,9 @@ from typing import Any, cast
 import pytest
 
 from appliance.errors import ConflictError, DeadlineError, NotFoundError, PayloadError, RefusedError, UnreachableError
-from appliance.model import Enquiry, encode
+from appliance.model import Enquiry, encode, keyspace
+from appliance.model.task_api import AnswerAsk, EnquiriesAsk
 from appliance.tasks import enquiries as module
-from appliance.tasks.api import AnswerAsk, EnquiriesAsk
 from appliance.tasks.audit import Audit
 from appliance.tasks.enquiries import Enquiries, enquiry_of, stronger
 
@@ -52,7 +52,7 @@ async def test_the_first_answer_wins_and_the_handler_gets_it(asking: Enquiries, 
     assert (await asking.answer(AnswerAsk(id="t:s1:1", answer="yes", by="ann"))).answer == "yes"
     assert notes == ["waits for an answer: May I?"]
     assert (await asking.enquiries(EnquiriesAsk(local=True))).enquiries == ()
-    told = plane.session.sent(plane.keys.enquiry("t:s1:1"), Enquiry)
+    told = plane.session.sent(plane.keys(keyspace.ENQUIRY, "t:s1:1"), Enquiry)
     assert [each.answer for each in told] == [None, "yes"]
 
 
@@ -123,7 +123,7 @@ def _fields(enquiry: Enquiry) -> dict[str, Any]:
 async def test_a_question_waits_on_while_its_record_cannot_be_read(
     asking: Enquiries, plane: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever has the record is silent for a while: the handler goes on waiting, and gets the answer given later."""
+    """The record's owner is silent for a while: the handler goes on waiting, and gets the answer given later."""
     monkeypatch.setattr(module, "LOOK_S", 0.01)
     task, _ = await asked(asking, question(expires_s=300.0))
     silent, read = asyncio.Event(), plane.dht.read

@@ -20,21 +20,22 @@ from appliance.model import (
     Tier,
     encode,
 )
+from appliance.model.task_api import ApproveAsk, Held, PauseAsk, RejectAsk, ResumeAsk, RetryAsk, RunAsk, RunStatus
 from appliance.tasks import machine
-from appliance.tasks.api import ApproveAsk, Held, PauseAsk, RejectAsk, ResumeAsk, RetryAsk, RunAsk, RunStatus
-from appliance.tasks.context import CancelAsked, Wake
+from appliance.tasks.events import CancelAsked, Wake
 from appliance.tasks.machine import plan_hash
-from appliance.tasks.record_writer import Keeper
+from appliance.tasks.record_writer import Draft, RecordWriter
 from appliance.tasks.steering import revived
 
 pytestmark = pytest.mark.anyio
 
+ONE_AFTER_ANOTHER = (Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",)))
 ON_ROBOT = (Subtask(id="s1", skill="work", robot="r1"), Subtask(id="s2", skill="work", after=("s1",)))
 
 
 async def proposed(bench: Any) -> TaskRecord:
     """Have a task whose first plan waits."""
-    bench.around.approve_why = "every plan is approved first"
+    bench.context.approve_why = "every plan is approved first"
     await bench.start()
     return await bench.until(lambda record: record.state is TaskState.PROPOSED)
 
@@ -56,10 +57,10 @@ async def test_a_plan_that_waits_runs_when_it_is_approved(bench: Any) -> None:
     """Nothing is sent before; the record says why it waits, by which hash, and then who approved it."""
     record = await proposed(bench)
     assert record.proposal.note == "every plan is approved first"
-    assert record.proposal.hash == plan_hash(bench.around.the_plan)
+    assert record.proposal.hash == plan_hash(bench.context.the_plan)
     assert record.proposal.expires_s == 600.0
     await asyncio.sleep(0.05)
-    assert bench.around.orders.empty()
+    assert bench.context.orders.empty()
     ask = ApproveAsk(id="t-1", hash=record.proposal.hash[:12], by="ann", why="looks right", act="o-1")
     approved = await bench.order(ask)
     assert approved.state is TaskState.RUNNING
@@ -67,7 +68,7 @@ async def test_a_plan_that_waits_runs_when_it_is_approved(bench: Any) -> None:
     assert bench.stored().decision == approved.decision
     _, request = await bench.ordered()
     assert request.subtask == "s1"
-    assert same(fold(bench), bench.driver.told)
+    assert same(fold(bench), bench.coordinator.written)
     again = await bench.order(ask)  # the answer was lost: the same order is done once
     assert again.decision == approved.decision
 
@@ -92,33 +93,33 @@ async def test_an_edited_plan_is_checked_before_it_is_taken(bench: Any) -> None:
     """What is wrong comes back as problems and the task waits on; a valid one runs, and the record says edited."""
     record = await proposed(bench)
     edited = bench.plan_of(Subtask(id="s1", skill="work", params={"n": 2}))
-    bench.around.problems = ("s1: there is no dock 9",)
+    bench.context.wrong = ("s1: there is no dock 9",)
     with pytest.raises(PlanError) as refused:
         await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=edited, by="ann"))
     assert refused.value.problems == ("s1: there is no dock 9",)
-    assert bench.driver.record.state is TaskState.PROPOSED
-    bench.around.problems = ()
+    assert bench.coordinator.record.state is TaskState.PROPOSED
+    bench.context.wrong = ()
     await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=edited, by="ann"))
     _, request = await bench.ordered()
     assert request.params == {"n": 2}
-    ran = bench.driver.record
+    ran = bench.coordinator.record
     assert ran.decision.edited
     assert (ran.decision.plan, ran.decision.note) == (record.proposal.plan, record.proposal.note)
-    assert same(fold(bench), bench.driver.told)
+    assert same(fold(bench), bench.coordinator.written)
 
 
 async def test_an_edited_plan_keeps_where_the_one_before_came_from(bench: Any) -> None:
     """Its provenance says that it was edited; one that is sent back as it was is no edit."""
     origin = Provenance(tier=Tier.LOCAL, confidence=0.7, key="k")
-    bench.around.the_plan = replace(bench.around.the_plan, provenance=origin)
+    bench.context.the_plan = replace(bench.context.the_plan, provenance=origin)
     record = await proposed(bench)
     edited = bench.plan_of(Subtask(id="s1", skill="work", params={"n": 2}))
     await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=edited, by="ann"))
     await bench.ordered()
-    ran = bench.driver.record
+    ran = bench.coordinator.record
     assert ran.plan.provenance == replace(origin, edited=True)
     assert ran.decision.plan.provenance == origin
-    assert same(fold(bench), bench.driver.told)
+    assert same(fold(bench), bench.coordinator.written)
 
 
 async def test_a_plan_that_is_sent_back_as_it_was_is_approved_and_not_edited(bench: Any) -> None:
@@ -126,7 +127,7 @@ async def test_a_plan_that_is_sent_back_as_it_was_is_approved_and_not_edited(ben
     record = await proposed(bench)
     await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash, plan=record.proposal.plan, by="ann"))
     await bench.ordered()
-    ran = bench.driver.record
+    ran = bench.coordinator.record
     assert (ran.decision.edited, ran.decision.plan) == (False, None)
 
 
@@ -137,24 +138,24 @@ async def test_an_approval_is_bound_to_the_hash(bench: Any) -> None:
         await bench.order(ApproveAsk(id="t-1", hash="0" * 64, by="ann"))
     with pytest.raises(RefusedError, match="too short"):
         await bench.order(ApproveAsk(id="t-1", hash="ab", by="ann"))
-    assert bench.driver.record.state is TaskState.PROPOSED
+    assert bench.coordinator.record.state is TaskState.PROPOSED
 
 
 async def test_a_plan_that_is_turned_down_cancels_its_task(bench: Any) -> None:
-    """Nothing has run; who said no and why is in the record, and later orders are told of it."""
+    """Nothing has run; who said no and why is in the record, and later orders hear of it."""
     await proposed(bench)
     await bench.order(RejectAsk(id="t-1", by="ann", why="the dock is closed"))
     ended = await bench.end()
     assert ended.state is TaskState.CANCELLED
     assert (ended.cancelled_by.by, ended.cancelled_by.why) == ("ann", "the dock is closed")
-    assert (ended.decision.plan, ended.decision.note) == (bench.around.the_plan, "every plan is approved first")
+    assert (ended.decision.plan, ended.decision.note) == (bench.context.the_plan, "every plan is approved first")
     assert same(fold(bench), ended)
 
 
 async def test_a_plan_that_nobody_approves_expires(bench: Any) -> None:
-    """The task fails with the reason, by its own clock, whoever coordinated it before."""
-    bench.around.config = replace(bench.around.config, approval_s=0.05)
-    bench.around.approve_why = "every plan is approved first"
+    """The task fails with the reason, by its own clock, whichever gateway coordinated it before."""
+    bench.context.config = replace(bench.context.config, approval_s=0.05)
+    bench.context.approve_why = "every plan is approved first"
     await bench.start()
     ended = await bench.end()
     assert ended.state is TaskState.FAILED
@@ -170,7 +171,7 @@ async def test_a_successor_waits_on_with_the_same_proposal(bench: Any) -> None:
     bench.task.cancel()
     await asyncio.gather(bench.task, return_exceptions=True)
     bench.plane.gateway = "gw-3"
-    bench.around.the_plan = PlanError("must not be asked again")
+    bench.context.the_plan = PlanError("must not be asked again")
     await bench.start(bench.stored())
     await bench.order(ApproveAsk(id="t-1", hash=record.proposal.hash))
     _, request = await bench.ordered()
@@ -186,7 +187,9 @@ async def test_cancel_while_a_plan_waits(bench: Any) -> None:
 
 async def test_a_paused_task_starts_nothing_and_goes_on_when_resumed(bench: Any) -> None:
     """What runs goes on to its end; its successor waits with the reason until somebody resumes."""
-    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",)))
+    bench.context.the_plan = bench.plan_of(
+        Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",))
+    )
     await bench.start()
     _, request = await bench.ordered()
     record = await bench.order(PauseAsk(id="t-1", by="ann", why="lunch", act="p"))
@@ -197,20 +200,20 @@ async def test_a_paused_task_starts_nothing_and_goes_on_when_resumed(bench: Any)
     await bench.until(lambda record: record.of("s2").state is SubtaskState.READY)
     bench.say(Wake())
     await asyncio.sleep(0.05)
-    assert bench.around.orders.empty()
+    assert bench.context.orders.empty()
     await bench.order(ResumeAsk(id="t-1", by="bob"))
     _, request = await bench.ordered()
     assert request.subtask == "s2"
-    assert same(fold(bench), bench.driver.told)
+    assert same(fold(bench), bench.coordinator.written)
 
 
 async def test_a_pause_with_hold_ends_runs_that_save_checkpoints(bench: Any) -> None:
     """Such a run is made ready to leave, ended, and goes on as the next attempt; another one is left alone."""
-    bench.around.skills = {
-        "work": replace(bench.around.skills["work"], checkpoints=True),
-        "plain": replace(bench.around.skills["work"], id="plain", checkpoints=False),
+    bench.context.skills = {
+        "work": replace(bench.context.skills["work"], checkpoints=True),
+        "plain": replace(bench.context.skills["work"], id="plain", checkpoints=False),
     }
-    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="plain"))
+    bench.context.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="plain"))
     cancelled: list[str] = []
 
     async def hold(gateway: str, ask: Any) -> Any:
@@ -235,7 +238,7 @@ async def test_a_pause_with_hold_ends_runs_that_save_checkpoints(bench: Any) -> 
     await bench.order(ResumeAsk(id="t-1", by="ann"))
     _, request = await bench.ordered()
     assert (request.subtask, request.attempt) == ("s1", 2)
-    assert same(fold(bench), bench.driver.told)
+    assert same(fold(bench), bench.coordinator.written)
 
 
 class Stopping:
@@ -266,8 +269,8 @@ class Stopping:
 
 async def test_a_soft_stop_pauses_tasks_of_the_robot_and_its_lifting_resumes_them(bench: Any) -> None:
     """The run is ended and counts for no failure, its late news is fenced off, and the next attempt follows."""
-    bench.around.the_plan = bench.plan_of(*ON_ROBOT)
-    bench.around.commands = stopping = Stopping()
+    bench.context.the_plan = bench.plan_of(*ON_ROBOT)
+    bench.context.commands = stopping = Stopping()
 
     async def cancel(gateway: str, ask: RunAsk) -> RunStatus:
         return RunStatus(running=False)
@@ -287,60 +290,62 @@ async def test_a_soft_stop_pauses_tasks_of_the_robot_and_its_lifting_resumes_the
     with pytest.raises(RefusedError, match="goes on when the stop is lifted"):
         await bench.order(ResumeAsk(id="t-1", by="bob"))
     await asyncio.sleep(0.05)
-    assert bench.around.orders.empty()
-    assert bench.driver.record.of("s1").failure is None
+    assert bench.context.orders.empty()
+    assert bench.coordinator.record.of("s1").failure is None
     stopping.lift()
     bench.say(Wake())
     _, request = await bench.ordered()
     assert request.attempt == 2
-    assert bench.driver.record.paused == ""
-    assert same(fold(bench), bench.driver.told)
+    assert bench.coordinator.record.paused == ""
+    assert same(fold(bench), bench.coordinator.written)
 
 
 async def test_a_stop_that_is_not_known_here_keeps_a_task_paused(bench: Any) -> None:
     """A successor that has not heard of the stop must not resume: only one that is known to be lifted ends a pause."""
-    bench.around.the_plan = bench.plan_of(*ON_ROBOT)
-    bench.around.commands = stopping = Stopping()
+    bench.context.the_plan = bench.plan_of(*ON_ROBOT)
+    bench.context.commands = stopping = Stopping()
     stopping.active = (SoftStop(id="st-1", by="ann"),)
     await bench.start()
     await bench.until(lambda record: bool(record.pauses))
     stopping.active = ()
     bench.say(Wake())
     await asyncio.sleep(0.05)
-    assert bench.driver.record.paused
-    assert bench.around.orders.empty()
+    assert bench.coordinator.record.paused
+    assert bench.context.orders.empty()
 
 
 async def test_a_task_without_the_robot_is_left_alone(bench: Any) -> None:
     """A stop of another robot means nothing for it."""
-    bench.around.commands = stopping = Stopping()
+    bench.context.commands = stopping = Stopping()
     stopping.active = (SoftStop(id="st-1", robots=("r9",), by="ann"),)
     await bench.start()
     await bench.ordered()
-    assert not bench.driver.record.pauses
+    assert not bench.coordinator.record.pauses
 
 
 async def test_a_lease_ends_the_run_and_the_subtask_waits(bench: Any) -> None:
     """The task is not paused; its run on that robot is left for later."""
-    bench.around.the_plan = bench.plan_of(*ON_ROBOT)
-    bench.around.commands = stopping = Stopping()
+    bench.context.the_plan = bench.plan_of(*ON_ROBOT)
+    bench.context.commands = stopping = Stopping()
     await bench.start()
     await bench.ordered()
     stopping.lease = "taken over by ann"
-    bench.around.robot = (None, "waits for r1: taken over by ann")
+    bench.context.robot = (None, "waits for r1: taken over by ann")
     bench.say(Wake())
     record = await bench.until(lambda record: record.of("s1").state is SubtaskState.READY)
     assert not record.pauses
     assert "taken over by ann" in record.of("s1").note
-    stopping.lease, bench.around.robot = "", ("r1", "")
+    stopping.lease, bench.context.robot = "", ("r1", "")
     bench.say(Wake())
     _, request = await bench.ordered()
     assert request.attempt == 2
 
 
 async def test_a_subtask_that_runs_is_tried_again_on_request(bench: Any) -> None:
-    """Its run is left, the next attempt begins; what has succeeded is kept, and what there is not is told."""
-    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",)))
+    """Its run is left, the next attempt begins; what has succeeded is kept, and what there is not is reported."""
+    bench.context.the_plan = bench.plan_of(
+        Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",))
+    )
     await bench.start()
     _, request = await bench.ordered()
     bench.tell(request, RunEventKind.SUCCEEDED, result={"n": 1})
@@ -354,14 +359,16 @@ async def test_a_subtask_that_runs_is_tried_again_on_request(bench: Any) -> None
     await bench.order(RetryAsk(id="t-1", subtask="s2", by="ann", act="r"))
     _, request = await bench.ordered()
     assert (request.subtask, request.attempt) == ("s2", 2)
-    assert bench.driver.record.retried_by.by == "ann"
-    assert same(fold(bench), bench.driver.told)
+    assert bench.coordinator.record.retried_by.by == "ann"
+    assert same(fold(bench), bench.coordinator.written)
 
 
 async def test_a_failed_task_is_tried_again(bench: Any) -> None:
-    """Attempts count on, the skill's retries count anew, what has succeeded is kept; the whole replays the same."""
-    bench.around.skills = {"work": replace(bench.around.skills["work"], retries=0)}
-    bench.around.the_plan = bench.plan_of(Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",)))
+    """Attempts count on, the skill's retries start from zero, what has succeeded is kept; it replays the same."""
+    bench.context.skills = {"work": replace(bench.context.skills["work"], retries=0)}
+    bench.context.the_plan = bench.plan_of(
+        Subtask(id="s1", skill="work"), Subtask(id="s2", skill="work", after=("s1",))
+    )
     await bench.start()
     _, request = await bench.ordered()
     bench.tell(request, RunEventKind.SUCCEEDED, result={"n": 1})
@@ -371,12 +378,12 @@ async def test_a_failed_task_is_tried_again(bench: Any) -> None:
     assert ended.state is TaskState.FAILED
     before = ended.of("s2").attempt
     stored = bench.plane.dht.records["task/t-1"]
-    keeper = Keeper(bench.plane, ended, stored.version, lambda _: None)
+    draft = Draft(ended, "gw-1")
     fields = revived(ended, RetryAsk(id="t-1", by="ann", act="r"), elapsed_s=ended.elapsed_s)
     assert fields is not None
-    keeper.apply(keeper.transition(machine.TransitionKind.RETRIED, **fields))
-    await keeper.flush()
-    record = keeper.record
+    draft.apply(machine.TransitionKind.RETRIED, **fields)
+    await RecordWriter(bench.plane, draft, stored.version).flush()
+    record = draft.record
     assert record.state is TaskState.RUNNING
     assert record.of("s1").state is SubtaskState.SUCCEEDED
     assert (record.of("s2").state, record.failure, record.retries) == (SubtaskState.READY, None, 1)
@@ -393,46 +400,46 @@ async def test_a_failed_task_is_tried_again(bench: Any) -> None:
 
 async def test_orders_that_come_while_it_is_planned_are_looked_at_afterwards(bench: Any) -> None:
     """A pause given before there is a plan holds its first subtask."""
-    bench.around.planning = asyncio.Event()
+    bench.context.planning = asyncio.Event()
     await bench.start()
     pausing = asyncio.create_task(bench.order(PauseAsk(id="t-1", by="ann")))
     await asyncio.sleep(0.02)
-    bench.around.planning.set()
+    bench.context.planning.set()
     assert (await pausing).pauses
     await asyncio.sleep(0.05)
     # The plan may have been begun in the same breath as the pause was read: nothing is started after it.
-    started = bench.around.orders.qsize()
+    started = bench.context.orders.qsize()
     await asyncio.sleep(0.05)
-    assert bench.around.orders.qsize() == started
+    assert bench.context.orders.qsize() == started
 
 
 async def test_an_order_that_a_driver_cannot_take_any_more_is_refused(bench: Any) -> None:
-    """Whoever waits hears that it was not written, and asks again."""
+    """The caller hears that it was not written, and asks again."""
     await bench.start()
     await bench.ordered()
     stored = bench.plane.dht.records["task/t-1"]
     bench.plane.dht.records["task/t-1"] = type(stored)(
-        key=stored.key, value=encode(bench.driver.record), version={"gw-2": 9}
+        key=stored.key, value=encode(bench.coordinator.record), version={"gw-2": 9}
     )
-    with pytest.raises(SwiftbotError, match="moved on"):
+    with pytest.raises(SwiftbotError, match="before it was written"):
         await bench.order(PauseAsk(id="t-1", by="ann"))
 
 
 async def test_a_robot_that_is_taken_at_the_vehicle_is_waited_for(bench: Any) -> None:
     """A pilot's takeover ends the run, counts for no failure, and the next attempt follows when it is given back."""
-    bench.around.the_plan = bench.plan_of(*ON_ROBOT)
+    bench.context.the_plan = bench.plan_of(*ON_ROBOT)
     await bench.start()
     _, request = await bench.ordered()
     bench.tell(request, RunEventKind.STARTED)
-    bench.around.robot = (None, "waits for r1: taken at the vehicle: its mode was changed")
+    bench.context.robot = (None, "waits for r1: taken at the vehicle: its mode was changed")
     taken = Failure(code="taken", message="r1 was taken over during goto: its mode was changed from AUTO to LOITER")
     bench.tell(request, RunEventKind.FAILED, failure=taken)
     record = await bench.until(lambda record: record.of("s1").state is SubtaskState.READY)
     assert record.state is TaskState.RUNNING
     assert record.of("s1").failure is None
     assert "from AUTO to LOITER" in record.of("s1").attempts[0].left
-    bench.around.robot = ("r1", "")
+    bench.context.robot = ("r1", "")
     bench.say(Wake())
     _, request = await bench.ordered()
     assert request.attempt == 2
-    assert same(fold(bench), bench.driver.told)
+    assert same(fold(bench), bench.coordinator.written)

@@ -29,7 +29,7 @@ def run(holding: Holding, keys: dict[float, str], until: float, step: float = 0.
 
 
 def test_held_key_moves_and_its_release_stops() -> None:
-    """While the key repeats the movement is asked for anew, each before the last one ends; then there is one stop."""
+    """While the key repeats the movement is asked for again, each before the last one ends; then there is one stop."""
     keys = {0.0: "forward"} | {0.5 + number / 30: "forward" for number in range(60)}
     sent = run(Holding(0.0), keys, 4.0)
     moves = [at for at, what in sent if what == "forward"]

@@ -73,7 +73,7 @@ def test_history_is_bounded(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"{", b'{"a": 1}', b"[1, 2]", b"\xff\xfe", b"[" * 100_000])
 def test_broken_history_costs_nothing_else(tmp_path: Path, content: bytes) -> None:
-    """A file that is none is told of and begun anew."""
+    """A file that is none is reported and begun again."""
     file = tmp_path / "h.json"
     file.write_bytes(content)
     history = History(file)
@@ -84,7 +84,7 @@ def test_broken_history_costs_nothing_else(tmp_path: Path, content: bytes) -> No
 
 
 def test_history_that_cannot_be_written(tmp_path: Path) -> None:
-    """Where nothing can be written the history is this process's own, and that is told."""
+    """Where nothing can be written the history is this process's own, and that is reported."""
     (tmp_path / "blocked").write_text("a file, not a folder")
     history = History(tmp_path / "blocked" / "h.json")
     history.add("one")

@@ -61,6 +61,8 @@ class View:
     fleet = "test"
     operator = "olga"
     steerable = True
+    moment = ""
+    role = None
 
     def __init__(self) -> None:
         self.store = Store()

@@ -1,6 +1,6 @@
 """What counts before and after say of leaks and memory."""
 
-from workshop.bench.census import Census, compare
+from workshop.bench.soak import Census, compare
 
 
 def test_what_comes_back_to_where_it_was_is_no_leak() -> None:
@@ -16,7 +16,7 @@ def test_what_comes_back_to_where_it_was_is_no_leak() -> None:
 
 
 def test_leaks_are_named_and_counted() -> None:
-    """A monitor more, or descriptors beyond what threads may hold, are leaks; memory that goes on growing is told."""
+    """A monitor more, or descriptors beyond what threads may hold, are leaks; memory that keeps growing is reported."""
     counts = [
         Census(runs=0, containers=4, conmon=4, descriptors=35, rss_mb=70.0),
         Census(runs=500, containers=4, conmon=4, descriptors=85, rss_mb=90.0),

@@ -10,8 +10,7 @@ from appliance.errors import DeadlineError, UnreachableError
 from appliance.model import TaskRecord, TaskState
 from appliance.plane.ring import Ring
 from appliance.tasks.machine import Transition, TransitionKind
-from workshop.bench.failover.logs import LogTail, wall_s
-from workshop.bench.failover.takeover import Heard, adoptions, apart, holder_without_a_part
+from workshop.bench.failover.takeover import Heard, LogTail, adoptions, apart, holder_without_a_part, wall_s
 
 pytestmark = pytest.mark.anyio
 
@@ -87,7 +86,7 @@ def test_a_run_that_two_coordinators_tell_of_is_one_run() -> None:
 
 
 async def test_two_coordinators_must_have_one_record_in_the_end() -> None:
-    """They may take a moment to agree; records that stay different, or cannot be read, are told with who has what."""
+    """They may take a moment to agree; records that stay different, or cannot be read, are named with who has what."""
     done = TaskRecord(id="t", instruction="i", state=TaskState.SUCCEEDED, coordinator="gw-1", sequence=7)
     behind = replace(done, coordinator="gw-2", sequence=6)
     has: dict[tuple[str, str], TaskRecord] = {

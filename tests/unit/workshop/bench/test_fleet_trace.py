@@ -6,7 +6,7 @@ import pytest
 
 from appliance.errors import ConfigError
 from appliance.pool.settings import PoolConfig
-from workshop.bench.fleet_trace import read_any
+from workshop.bench.policy import read_any
 from workshop.simulators.pool import simulate
 
 LOGS = Path(__file__).parents[3] / "replay" / "logs"
@@ -23,7 +23,7 @@ def test_a_log_becomes_a_trace_that_can_be_played() -> None:
 
 
 def test_a_file_without_arrivals_is_refused(tmp_path: Path) -> None:
-    """An empty JSONL file is told as such."""
+    """An empty JSONL file is reported as such."""
     path = tmp_path / "empty.jsonl"
     path.write_text("")
     with pytest.raises(ConfigError, match="no arrivals"):

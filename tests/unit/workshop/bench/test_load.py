@@ -83,7 +83,7 @@ def test_slow_starts_break_with_their_cause() -> None:
 
 
 def test_nothing_served() -> None:
-    """A load of which nothing is served is told once, without a p99 that does not exist."""
+    """A load of which nothing is served is reported once, without a p99 that does not exist."""
     found = verdict([Outcome(problem="lost")] * 5, Sampled(), limit_ms=1000)
     assert found[0] == "not served: 5 lost of 5"
     assert not any("p99" in each for each in found)
@@ -104,7 +104,7 @@ def test_the_account_of_a_rate() -> None:
 
 
 def test_what_the_tail_is_made_of() -> None:
-    """Each phase has its own figures, and the slowest starts are told one by one with what their gateway took."""
+    """Each phase has its own figures, and the slowest starts are reported one by one with what their gateway took."""
     slow = Outcome(started_ms=80.0, within_ms=75.0, ended_ms=90.0, asked="a", gateway="b", phase="remote warm")
     found = account([*served(99), slow], Sampled())
     assert found["ways"]["remote warm"]["within"]["max"] == 75.0

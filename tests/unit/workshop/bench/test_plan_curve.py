@@ -2,9 +2,8 @@
 
 import pytest
 
-from workshop.bench.plan.curve import Answered, curve
 from workshop.bench.plan.load import INSTRUCTIONS, Told, account
-from workshop.bench.plan.quality import run
+from workshop.bench.plan.quality import Answered, curve, run
 
 pytestmark = pytest.mark.anyio
 

@@ -21,8 +21,7 @@ from workshop.bench.policy import (
     over_gateways,
     run,
 )
-from workshop.simulators.pool.recorded import write_trace
-from workshop.simulators.pool.traces import plain
+from workshop.simulators.pool.traces import plain, write_trace
 
 
 def point(budget_mb: int, cold_percent: float, wasted_gb: float) -> Point:

@@ -21,7 +21,7 @@ def test_a_straight_line_has_its_slope(start: int, per_min: int, count: int) -> 
 
 
 def test_too_few_samples_have_no_slope() -> None:
-    """Nothing, or one moment, is told as it is and has no slope."""
+    """Nothing, or one moment, is shown as it is and has no slope."""
     assert resident([])["mb_per_min"] is None
     assert resident([[1.0, 70.0]]) == {
         "start": 70.0, "end": 70.0, "most": 70.0, "mb_per_min": None, "mb_per_min_second_half": None,

@@ -99,7 +99,7 @@ def test_unknown_commands_are_unsupported(number: int) -> None:
 
 
 def test_unknown_modes_and_empty_missions_are_refused() -> None:
-    """A mode that does not exist and AUTO without a mission fail; what others are told is not for it."""
+    """A mode that does not exist and AUTO without a mission fail; what is sent to others is not for it."""
     pilot = Pilot()
     assert pilot.command(dialect.SET_MODE, 1, 99) == dialect.FAILED
     assert pilot.mode("AUTO") == dialect.FAILED

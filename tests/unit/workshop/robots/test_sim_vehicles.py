@@ -128,7 +128,7 @@ def test_failsafes_change_the_mode_and_tell(parameters: dict[str, float], mode: 
 
 
 def test_a_lost_ground_station() -> None:
-    """Only where it is enabled, only after the station was heard, and its return is told."""
+    """Only where it is enabled, only after the station was heard, and its return is seen."""
     pilot = copter()
     beat = {"type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3}
     pilot.up()

@@ -147,7 +147,7 @@ def test_devices_are_switched_and_doors_are_not() -> None:
 
 
 def test_people_near_enough_are_found_and_answer() -> None:
-    """The nearest, or the one named; too far and unknown people are told; the fullest match of a question counts."""
+    """The nearest, or the one named; too far and unknown people are named; the fullest match of a question counts."""
     world = World(LIVELY)
     ann = world.person("", IN_HALL)
     assert ann.name == "Ann"

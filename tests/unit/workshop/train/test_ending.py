@@ -26,7 +26,7 @@ def test_an_error_is_told_with_its_remedy(capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_asks_to_stop_and_a_second_one_does(number: signal.Signals) -> None:
-    """The first is left to whoever looks, between two steps; afterwards signals do what they did before."""
+    """The first is left to the code that looks, between two steps; afterwards signals do what they did before."""
     before = signal.getsignal(number)
     with Stopping() as stopping:
         assert not stopping.asked

@@ -56,7 +56,7 @@ def test_two_values_of_four_bits_share_a_byte_the_lower_one_first() -> None:
 
 
 def test_what_is_no_planner_is_told(tmp_path: Path) -> None:
-    """An empty folder has no model; a damaged or foreign one is told by what is wrong with it."""
+    """An empty folder has no model; a damaged or foreign one is reported by what is wrong with it."""
     with pytest.raises(NotFoundError, match=r"has no model\.onnx"):
         read_weights(tmp_path)
     folder = tmp_path / "model"

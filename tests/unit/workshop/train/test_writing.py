@@ -1,11 +1,11 @@
-"""What cannot be written is told with cause and remedy, and leaves nothing half written."""
+"""What cannot be written is reported with cause and remedy, and leaves nothing half written."""
 
 from pathlib import Path
 
 import pytest
 
 from appliance.errors import PrerequisiteError
-from workshop.train.writing import replace_text, writing
+from workshop.train.ending import replace_text, writing
 
 FULL = [
     pytest.param(OSError(28, "No space left on device"), id="the system's own"),
@@ -59,7 +59,7 @@ def test_an_interruption_is_no_failure_to_write(tmp_path: Path) -> None:
 
 
 def test_a_file_that_cannot_be_replaced_is_what_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A recipe that is written anew on a full disk is not an empty one afterwards: the run would be lost."""
+    """A recipe that is written again on a full disk is not an empty one afterwards: the run would be lost."""
     path = tmp_path / "recipe.json"
     replace_text(path, "one")
     replace_text(path, "two")

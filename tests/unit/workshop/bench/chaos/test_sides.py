@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.model import Decision, TaskRecord, TaskState, Word
-from workshop.bench.chaos.sides import KINDS, Agreement, Cut, Given, account, broken, contested, view
+from workshop.bench.chaos.partition import KINDS, Agreement, Cut, Given, account, broken, contested, view
 from workshop.bench.net.faults import FAULTS, PARTITION, phases
 
 ROBOTS = ("ledger_1", "ledger_2")

@@ -78,7 +78,7 @@ def test_a_run_takes_what_comes_free_before_its_own() -> None:
     outcome = simulate(trace, BARE)
     assert (outcome.cold, outcome.local, outcome.sooner, outcome.lost) == (1, 1, 1, 0)
     assert outcome.p50_ms == 300.0 + WARM_MS
-    assert outcome.used_gb_s == 0.5 + 1.0 + 0.5 + 1.0  # a start for a run is no waste, whoever has the container then
+    assert outcome.used_gb_s == 0.5 + 1.0 + 0.5 + 1.0  # a start for a run is no waste, whatever runs in it
     assert outcome.wasted_gb_s == 97.5 + 98.3
     bound = simulate(trace, BARE, binds=True)
     assert (bound.cold, bound.local, bound.sooner) == (2, 0, 0)

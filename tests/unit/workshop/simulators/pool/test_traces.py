@@ -7,8 +7,7 @@ from statistics import mean, pstdev
 import pytest
 
 from appliance.errors import ConfigError
-from workshop.simulators.pool.recorded import read_trace, write_trace
-from workshop.simulators.pool.traces import KINDS, Trace, azure, plain
+from workshop.simulators.pool.traces import KINDS, Trace, azure, plain, read_trace, write_trace
 
 
 def variation(trace: Trace, image: str) -> float:
@@ -64,7 +63,7 @@ def test_a_recorded_trace_comes_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("line", ["", "{", '{"at_s": 1}', '{"at_s": -1, "image": "a", "service_s": 1}', "[]"])
 def test_what_is_no_trace_is_refused(tmp_path: Path, line: str) -> None:
-    """A damaged line is told with its number."""
+    """A damaged line is reported with its number."""
     path = tmp_path / "bad.jsonl"
     path.write_text(line + "\n")
     with pytest.raises(ConfigError, match=r"line 1|no arrivals"):

@@ -1,0 +1,274 @@
+"""Releases of the program on this machine: `swiftbot upgrade`, `rollback`, `release …`."""
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+from msgspec import Struct
+from rich.table import Table
+from rich.text import Text
+
+from appliance import console
+from appliance.cli.common import TOOLS, Json, show
+from appliance.errors import ConfigError, Exit
+
+if TYPE_CHECKING:
+    from appliance.deploy.layout import Layout
+    from appliance.deploy.upgrade import Ended, Upgrade
+
+release_app = App(name="release", help="List, check and make releases of the program.", group=TOOLS)
+
+Root = Annotated[Path, Parameter(help="Installation to change, instead of that of this machine.")]
+ConfigFile = Annotated[Path, Parameter(help="The gateway's TOML file, for the check.")]
+HERE = Path("/")
+CONFIG = Path("/etc/swiftbot/gateway.toml")
+
+
+class ReleaseShown(Struct, frozen=True, kw_only=True):
+    """A release that is installed."""
+
+    id: str
+    version: str
+    made: float
+    """Unix seconds."""
+    current: bool
+    previous: bool
+
+
+class BundleShown(Struct, frozen=True, kw_only=True):
+    """A bundle whose signature and files are good."""
+
+    release: str
+    version: str
+    architecture: str
+    python: str
+    made: float
+    """Unix seconds."""
+    files: int
+    bytes: int
+    images: tuple[str, ...]
+
+
+def add_to(app: App) -> None:
+    """Add these commands."""
+    for command in (upgrade, rollback):
+        app.command(command, group=TOOLS)
+    app.command(release_app)
+
+
+async def upgrade(
+    file: Path | None = None,
+    /,
+    *,
+    resume: bool = False,
+    older: bool = False,
+    root: Root = HERE,
+    config: ConfigFile = CONFIG,
+    as_json: Json = False,
+) -> int:
+    """Install a signed bundle beside the release that runs, switch to it, and go back if it does not work.
+
+    Services drain, stop, and start with the new release; then they must stay up, and `swiftbot doctor` must find
+    nothing that it did not find before. Run as root.
+
+    Args:
+        file: Bundle, as `make bundle` writes it.
+        resume: Finish an upgrade that was interrupted, as the system does at boot.
+        older: Install an older version than the one that runs.
+    """
+    from appliance.deploy import bundle as bundles
+    from appliance.deploy import host
+    from appliance.deploy.upgrade import Ended
+
+    upgrading = _upgrading(root, config)
+    layout = _layout(root)
+    if resume:
+        with upgrading.alone(make=False):
+            ended = await upgrading.resume()
+            if ended is None:
+                ended = Ended(release=layout.running(), before=layout.before())
+                show(ended, as_json=as_json, table=Text("no upgrade was interrupted"))
+                return Exit.DONE
+            return _show_ended(ended, as_json=as_json)
+    if file is None:
+        raise ConfigError("no bundle is named", remedy="swiftbot upgrade FILE; --resume finishes an interrupted one")
+    # The signature comes before the lock, whose folder is made: below a mistyped --root no key is trusted.
+    with bundles.opened(file, bundles.load_trusted(root / bundles.TRUSTED)) as bundle, upgrading.alone():
+        upgrading.check_none()
+        running = next((each.version for each in layout.installed() if each.id == layout.running()), "")
+        bundle.check_for(architecture=host.architecture(), python=host.python(), running=running, older=older)
+        _say(f"{file}: {bundle.manifest.release}, signature good; {running or 'nothing'} runs")
+        release = await host.lay_out(bundle, layout, say=_say)
+        return _show_ended(await upgrading.to(release), as_json=as_json)
+
+
+async def rollback(*, root: Root = HERE, config: ConfigFile = CONFIG, as_json: Json = False) -> int:
+    """Go back to the release before. Run as root."""
+    upgrading = _upgrading(root, config)
+    with upgrading.alone(make=False):
+        return _show_ended(await upgrading.rollback(), as_json=as_json)
+
+
+@release_app.command(name="list")
+async def list_(*, root: Root = HERE, as_json: Json = False) -> int:
+    """List the releases that are installed, the newest first."""
+    layout = _layout(root)
+    try:
+        rows = [
+            ReleaseShown(
+                id=each.id,
+                version=each.version,
+                made=each.made,
+                current=each.id == layout.running(),
+                previous=each.id == layout.before(),
+            )
+            for each in reversed(layout.installed())
+        ]
+    except OSError as error:
+        raise ConfigError(
+            f"{layout.prefix} cannot be read: {error.strerror}", remedy="check --root and its owner (ls -ld)"
+        ) from error
+    table = Table()
+    for column in ("release", "installed", ""):
+        table.add_column(column)
+    for row in rows:
+        mark = "current" if row.current else "previous" if row.previous else ""
+        table.add_row(row.id, time.strftime("%Y-%m-%d %H:%M", time.localtime(row.made)), mark)
+    show(rows, as_json=as_json, table=table)
+    return Exit.DONE
+
+
+@release_app.command(name="show")
+async def show_(
+    file: Path,
+    /,
+    *,
+    trusted: Annotated[
+        Path | None, Parameter(help="File of public keys, instead of /etc/swiftbot/release.pub.")
+    ] = None,
+    as_json: Json = False,
+) -> int:
+    """Check signature and files of a bundle, and show what is in it.
+
+    Args:
+        file: Bundle, as `make bundle` writes it.
+    """
+    from appliance.deploy import bundle as bundles
+
+    with bundles.opened(file, bundles.load_trusted(trusted or HERE / bundles.TRUSTED)) as bundle:
+        bundle.check()
+    manifest = bundle.manifest
+    shown = BundleShown(
+        release=manifest.release,
+        version=manifest.version,
+        architecture=manifest.architecture,
+        python=manifest.python,
+        made=manifest.made,
+        files=len(manifest.members),
+        bytes=manifest.size,
+        images=tuple(Path(each.name).stem for each in manifest.members if each.name.startswith("images/")),
+    )
+    text = Text(
+        f"{manifest.release} for {manifest.architecture}, Python {manifest.python}\n"
+        f"  made     {time.strftime('%Y-%m-%d %H:%M', time.localtime(manifest.made))}\n"
+        f"  files    {shown.files}, {shown.bytes / 2**20:.0f} MiB, all as the manifest says\n"
+        f"  images   {', '.join(shown.images) or 'none: built on the gateway'}\n"
+        "  signed by a key that is trusted"
+    )
+    show(shown, as_json=as_json, table=text)
+    return Exit.DONE
+
+
+@release_app.command(name="key")
+async def key_(file: Path, /, *, as_json: Json = False) -> int:
+    """Make the key that signs bundles, and its public half, FILE.pub, which every gateway needs.
+
+    Args:
+        file: File to write.
+    """
+    from appliance.deploy import bundle as bundles
+
+    public = bundles.make_key(file)
+    text = Text(
+        f"made {file} (keep it off the gateways) and {public}\n"
+        f"next: copy {public} to /{bundles.TRUSTED} on every gateway"
+    )
+    show({"private": str(file), "public": str(public)}, as_json=as_json, table=text)
+    return Exit.DONE
+
+
+@release_app.command(name="pack")
+async def pack_(
+    folder: Path,
+    /,
+    *,
+    key: Annotated[Path, Parameter(help="Key that signs it, made by `swiftbot release key`.")],
+    out: Annotated[Path, Parameter(help="File to write.")],
+    tree: Annotated[Path, Parameter(help="Source tree that it was made of.")],
+    as_json: Json = False,
+) -> int:
+    """Pack and sign what `make bundle` has gathered in a folder.
+
+    Args:
+        folder: With wheels, tools, units, pages and images.
+    """
+    from appliance.deploy import bundle as bundles
+    from appliance.deploy import host
+    from appliance.deploy.layout import id_of, version_of
+
+    manifest = bundles.pack(
+        folder,
+        out,
+        bundles.load_key(key),
+        release=id_of(tree),
+        version=version_of(tree),
+        architecture=host.architecture(),
+        made=float(os.environ.get("SOURCE_DATE_EPOCH") or int(time.time())),
+    )
+    size = out.stat().st_size
+    text = Text(f"{out}: {manifest.release}, {len(manifest.members)} files, {size / 2**20:.0f} MiB")
+    show({"file": str(out), "release": manifest.release, "bytes": size}, as_json=as_json, table=text)
+    return Exit.DONE
+
+
+def _layout(root: Path) -> "Layout":
+    from appliance.deploy.layout import Layout
+
+    return Layout(root)
+
+
+def _upgrading(root: Path, config: Path) -> "Upgrade":
+    from appliance.deploy.host import Machine
+    from appliance.deploy.upgrade import Upgrade
+
+    here = root.resolve() == HERE
+    if here and os.getuid() != 0:
+        raise ConfigError("this needs root: it changes /opt/swiftbot and restarts services", remedy="sudo swiftbot …")
+    machine = Machine(config=config, services=here)
+    if not here:
+        _say(f"the services of this machine do not run from {root}: they stay as they are")
+    elif not machine.systemd:
+        _say("systemd does not run here: start the daemons again yourself after the switch")
+    return Upgrade(_layout(root), machine, say=_say)
+
+
+def _say(text: str) -> None:
+    console.err.print(f"[{time.strftime('%H:%M:%S')}] {text}", markup=False, highlight=False)
+
+
+def _show_ended(ended: "Ended", *, as_json: bool) -> int:
+    if ended.problem:
+        now = f"{ended.release} runs again" if ended.rolled_back else f"{ended.release} is current"
+        text = Text(f"not upgraded: {ended.problem}\n{now}")
+        if ended.problem_back:
+            text.append(
+                f"\nbut it does not work either: {ended.problem_back}\n  hint: journalctl -u swiftbot-gateway -n 50"
+            )
+    else:
+        text = Text(f"{ended.release} runs; `swiftbot rollback` goes back to {ended.before or 'nothing'}")
+        if ended.removed:
+            text.append(f"\nremoved: {', '.join(ended.removed)}")
+    show(ended, as_json=as_json, table=text)
+    return Exit.FAILED if ended.problem else Exit.DONE

@@ -1,0 +1,70 @@
+"""Robots in maintenance and closed places in the terminal UI."""
+
+# pyright: reportPrivateUsage=false, reportArgumentType=false
+
+from typing import TYPE_CHECKING
+
+import pytest
+from msgspec.structs import replace
+
+from appliance.model import Word
+from appliance.model.closures import Closure, ClosureList
+from appliance.plane.settings import PlaneConfig
+from appliance.tui.app import SwiftbotApp
+from appliance.tui.robot_view import places
+from appliance.tui.subscriptions import FleetView
+
+from .conftest import SITE
+from .pictures import settle
+
+if TYPE_CHECKING:
+    from .conftest import FakeView
+
+pytestmark = pytest.mark.anyio
+ROBOT = Closure(kind="robot", name="drone-1", by=Word(by="ann", why="tyres", at_ns=5))
+PLACE = Closure(kind="place", name="gate", by=Word(by="ann", at_ns=5))
+
+
+@pytest.mark.parametrize("size", [(80, 24), (160, 48)])
+async def test_the_screen_of_robots_shows_what_is_out_of_use(view: "FakeView", size: tuple[int, int]) -> None:
+    """The robot says so in its row, its own screen what ends it; the place in its name on the map; until it is over."""
+    app = SwiftbotApp(view)
+    async with app.run_test(size=size) as pilot:
+        await pilot.press("3")
+        view.store.take_closure(ROBOT)
+        view.store.take_closure(PLACE)
+        shown = await settle(app, pilot)
+        assert "◌ in maint" in shown
+        assert "gate closed" in shown or size != (80, 24)  # a wide map has other labels where this one would stand
+        await pilot.press("enter")
+        assert "maintain drone-1 --end" in " ".join((await settle(app, pilot)).split())
+        view.store.take_closure(replace(ROBOT, ended_ns=9))
+        assert "maint" not in await settle(app, pilot)
+
+
+def test_an_older_word_changes_nothing(view: "FakeView") -> None:
+    """Puts may come in either order, and an answer may be older than a put."""
+    view.store.take_closure(ROBOT)
+    view.store.take_closure(replace(ROBOT, by=Word(by="bob", at_ns=1), ended_ns=2))
+    assert view.store.out_of_use("robot", 10) == {"drone-1": "in maintenance by ann: tyres"}
+    view.store.take_closures((), known=(ROBOT.id,))
+    assert view.store.out_of_use("robot", 10) == {}
+
+
+async def test_what_is_out_of_use_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal UI that is opened later knows it as well."""
+
+    class Orders:
+        async def closures(self) -> ClosureList:
+            return ClosureList(closures=(ROBOT,))
+
+    made = FleetView(PlaneConfig(), "test")
+    monkeypatch.setattr(FleetView, "orders", Orders())
+    await made._ask_closures()
+    assert set(made.store.closures) == {ROBOT.id}
+
+
+def test_a_map_calls_a_closed_place_closed() -> None:
+    """At its position."""
+    assert places(SITE, {"gate"})["gate closed"] == (5.0, 8.0)
+    assert set(places(SITE)) == {"gate", "cold store"}
