@@ -30,6 +30,7 @@ import time
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -354,10 +355,19 @@ class CommandServer:
         elif message.command != CANCEL:
             work = self._begin(sender, frame, reply, robot, asker)
         else:
-            work = self._cancel(frame, reply, last, asker or f"{STATION}{sender}")
+            work = self._cancel(sender, frame, reply, last, asker or f"{STATION}{sender}")
         running = asyncio.create_task(work, name=f"MAVLink request of {sender}")
         self._at_work[sender] = _Work(code=code, running=running)
-        running.add_done_callback(lambda _: self._at_work.pop(sender, None))
+        running.add_done_callback(partial(self._done, sender))
+
+    def _done(self, sender: str, running: asyncio.Task[None] | None = None) -> None:
+        """A sender's request has its answer: what it sends from now on is looked at by itself.
+
+        Called before the answer is sent, since a repetition may come before this program's task has ended.
+        """
+        at_work = self._at_work.get(sender)
+        if at_work is not None and running in (None, at_work.running):
+            del self._at_work[sender]
 
     def _repeated(self, message: Message, last: Asked) -> bool:
         """Whether a command that says the same as the sender's last one is that again, and not another order."""
@@ -415,6 +425,7 @@ class CommandServer:
                 await self._store.put(PREFIX + sender, encode(asked))
         except SwiftbotError as error:
             log.warning("the answer to a request could not be kept", sender=sender, reason=str(error))
+        self._done(sender)
         self._reply(frame, reply, asked)
 
     def _request(self, asked: Asked, *, robot: str, submitter: str) -> TaskRequest:
@@ -430,25 +441,28 @@ class CommandServer:
         text = instruction(template, parameters, robot=robot)
         return TaskRequest(instruction=text, id=asked.task, submitter=submitter)
 
-    async def _cancel(self, frame: Frame, reply: Callable[[Message], None], last: Asked | None, by: str) -> None:
+    async def _cancel(
+        self, sender: str, frame: Frame, reply: Callable[[Message], None], last: Asked | None, by: str
+    ) -> None:
         if last is None or self._tasks is None:
             self._say(reply, "no task of yours is known here", _ERROR)
             self._answer(frame, reply, dialect.DENIED)
             return
         self._answer(frame, reply, dialect.IN_PROGRESS)
+        number = 0
         try:
             record = await self._tasks.cancel(last.task, by)
-        except NotFoundError as error:
-            self._say(reply, error.message, _ERROR)
-            self._answer(frame, reply, dialect.DENIED)
         except SwiftbotError as error:
             self._say(reply, error.message, _ERROR)
-            self._answer(frame, reply, dialect.TEMPORARILY_REJECTED)
+            result = dialect.DENIED if isinstance(error, NotFoundError) else dialect.TEMPORARILY_REJECTED
         else:
+            number = task_number(last.task)
             ended = record.state.final and record.state is not TaskState.CANCELLED
+            result = dialect.DENIED if ended else dialect.ACCEPTED
             if ended:
                 self._say(reply, f"{last.task} had {record.state} already", _NOTICE)
-            self._answer(frame, reply, dialect.DENIED if ended else dialect.ACCEPTED, number=task_number(last.task))
+        self._done(sender)
+        self._answer(frame, reply, result, number=number)
 
     def _take_cancel(self, sender: str, frame: Frame, reply: Callable[[Message], None], by: str) -> None:
         """Take a COMMAND_CANCEL; its repetitions while it is carried out need no answer of their own."""

@@ -41,6 +41,8 @@ class Fleet:
         self.gate.set()
         self.said: list[Message] = []
         self.refused: dict[str, int] = {}
+        self.on_answer: list[Callable[[], None]] = []
+        """What the sender does in the very moment of each final answer."""
         self.desk = self.new_desk()
 
     def new_desk(self) -> CommandServer:
@@ -96,7 +98,12 @@ class Fleet:
         common = {"target_system": 1, "target_component": 191, "command": 31010}
         (frame,) = Codec(245, 191).read(Codec(*source).pack(make(name, **(common | numbers | fields))))
         assert isinstance(frame, Frame)
-        self.desk.take(frame, robot=robot, asker=asker, reply=self.said.append)
+        self.desk.take(frame, robot=robot, asker=asker, reply=self._reply)
+
+    def _reply(self, message: Message) -> None:
+        self.said.append(message)
+        if message.get_type() == "COMMAND_ACK" and message.result != IN_PROGRESS and self.on_answer:
+            self.on_answer.pop(0)()
 
     @property
     def acks(self) -> list[tuple[int, int]]:

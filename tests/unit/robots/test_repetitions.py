@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from appliance.errors import RefusedError, SwiftbotError
 from appliance.robots.mavlink.command_server import REPEAT_S, task_number
 from tests.unit.robots.conftest import FakeStore
 from tests.unit.robots.test_command_server import ACCEPTED, DENIED, IN_PROGRESS, TEMPORARILY_REJECTED, Fleet
@@ -119,3 +120,25 @@ async def test_a_refusal_is_repeated_alike(fleet: Timed) -> None:
     await fleet.answered(4)
     assert [result for result, _ in fleet.acks] == [IN_PROGRESS, DENIED, DENIED, DENIED]
     assert fleet.refused == {"mavlink_request_denied": 1}
+
+
+@pytest.mark.parametrize("error", [None, RefusedError("busy")])
+async def test_a_repetition_in_the_moment_of_the_answer_is_answered(fleet: Timed, error: SwiftbotError | None) -> None:
+    """It crosses the final answer: it hears that one again (or is tried again), and not merely that work goes on."""
+    fleet.error = error
+    fleet.on_answer.append(lambda: fleet.send(param1=1.0, confirmation=1))
+    fleet.send(param1=1.0)
+    await fleet.answered(3 if error is None else 4)
+    results = [result for result, _ in fleet.acks]
+    assert results == ([IN_PROGRESS, ACCEPTED, ACCEPTED] if error is None else [IN_PROGRESS, TEMPORARILY_REJECTED] * 2)
+    assert len(fleet.submitted) == (1 if error is None else 0)
+
+
+async def test_a_cancel_repeated_in_the_moment_of_its_answer_is_answered(fleet: Timed) -> None:
+    """USER_2 likewise."""
+    fleet.send(param1=1.0)
+    await fleet.answered(2)
+    fleet.on_answer.append(lambda: fleet.send(command=31011))
+    fleet.send(command=31011)
+    await fleet.answered(6)
+    assert [result for result, _ in fleet.acks[2:]] == [IN_PROGRESS, ACCEPTED] * 2
