@@ -332,7 +332,7 @@ class Wire:
         return Closer(end)
 
     def hold_questions(self) -> None:
-        """Have questions wait from now on; `let_go` sends them. Puts and answers go on."""
+        """Have questions wait from now on, but urgent ones; `let_go` sends them. Puts and answers go on."""
         self.held = True
 
     async def hold_all(self, within_s: float) -> None:
@@ -361,9 +361,14 @@ class Wire:
         while self._held_questions:
             self.send(*self._held_questions.popleft())
 
-    def ask(self, key: str, ask: Callable[[], None], size: int, *, direct: bool = False) -> None:
-        """Have a question sent, by the sender's thread; `direct`: by this one, where nothing holds it up."""
-        if self.held and len(self._held_questions) >= self.config.queue_messages:
+    def ask(self, key: str, ask: Callable[[], None], size: int, *, direct: bool = False, urgent: bool = False) -> None:
+        """Have a question sent, by the sender's thread; `direct`: by this one, where nothing holds it up.
+
+        `urgent`: also while questions wait for the session to be reopened.
+        """
+        if urgent:
+            self.send(key, ask, size)
+        elif self.held and len(self._held_questions) >= self.config.queue_messages:
             self.refuse("outgoing queue full", key=key)
         elif self.held:
             self._held_questions.append((key, ask, size))
@@ -1235,6 +1240,8 @@ class Asking:
         self._doors = doors
         self.open: set[asyncio.Future[bytes]] = set()
         """Answers that are awaited."""
+        self.urgent: set[asyncio.Future[bytes]] = set()
+        """Those of them that are urgent."""
 
     async def query(
         self,
@@ -1245,12 +1252,14 @@ class Asking:
         bulk: bool = False,
         direct: bool = False,
         sign: bool = False,
+        urgent: bool = False,
     ) -> bytes:
         """Ask the one that serves a key and return the first answer; `bulk`: other messages go before it.
 
         `direct`: sent from here, past the queue of the sender's thread, and dropped when the link is full. For small
         questions that can be asked again, where the way there and back matters.
         `sign`: with the keys of this process, if it has any.
+        `urgent`: also while others wait for the session to be reopened; not with `direct`.
 
         Raises:
             UnreachableError: nobody serves the key, or (`sent`) one that may have heard it went away before answering.
@@ -1258,7 +1267,8 @@ class Asking:
             PayloadError: the request or the answer is too large.
             SwiftbotError: what the answering side raised.
         """
-        return await self.ask(key, payload, timeout_s=timeout_s, bulk=bulk, direct=direct, sign=sign).answer()
+        question = self.ask(key, payload, timeout_s=timeout_s, bulk=bulk, direct=direct, sign=sign, urgent=urgent)
+        return await question.answer()
 
     def ask(
         self,
@@ -1269,9 +1279,10 @@ class Asking:
         bulk: bool = False,
         direct: bool = False,
         sign: bool = False,
+        urgent: bool = False,
     ) -> "Question":
         """Do the same, but only send the question, and have the answer awaited afterwards."""
-        return Question(self, self._wire, key, payload, timeout_s, bulk=bulk, direct=direct, sign=sign)
+        return Question(self, self._wire, key, payload, timeout_s, bulk=bulk, direct=direct, sign=sign, urgent=urgent)
 
     async def query_all(self, expr: str, payload: bytes, *, timeout_s: float) -> list[Message]:
         """Ask everybody who serves a key of `expr`; returns the answers that came in time, errors left out.
@@ -1332,6 +1343,7 @@ class Asking:
         target: zenoh.QueryTarget,
         bulk: bool = False,
         direct: bool = False,
+        urgent: bool = False,
         meant: bytes | None = None,
     ) -> None:
         """Send a query; both callbacks come by the event loop, `on_end` only where no answer came first."""
@@ -1400,7 +1412,7 @@ class Asking:
             )
             sender = 0
 
-        self._wire.ask(expr, ask, len(payload), direct=direct)
+        self._wire.ask(expr, ask, len(payload), direct=direct, urgent=urgent)
 
     def stop(self) -> None:
         """End every question under way with an error."""
@@ -1423,9 +1435,10 @@ class Question:
         bulk: bool,
         direct: bool,
         sign: bool,
+        urgent: bool,
     ) -> None:
         self._asking = asking
-        self._sign = sign
+        self._sign, self._urgent = sign, urgent
         self._credentials = wire.credentials
         self._key, self._payload = key, payload
         self._timeout_s, self._until = timeout_s, wire.loop.time() + timeout_s
@@ -1433,6 +1446,8 @@ class Question:
         self._loop = wire.loop
         self._answer: asyncio.Future[bytes] = wire.loop.create_future()
         asking.open.add(self._answer)
+        if urgent:
+            asking.urgent.add(self._answer)
         self._timer = wire.loop.call_at(self._until, self._on_time)
         try:
             self._send()
@@ -1451,6 +1466,7 @@ class Question:
             target=zenoh.QueryTarget.BEST_MATCHING,
             bulk=self._bulk,
             direct=self._direct,
+            urgent=self._urgent,
             meant=link.mark(self._key, direct=self._direct, signature=signature),
         )
 
@@ -1486,6 +1502,7 @@ class Question:
         """Wait for it no more; more than once does no harm."""
         self._timer.cancel()
         self._asking.open.discard(self._answer)
+        self._asking.urgent.discard(self._answer)
         if not self._answer.cancel() and not self._answer.cancelled():
             self._answer.exception()  # looked at: nobody else may come to
 
@@ -1603,8 +1620,13 @@ class Session:
         linked = set(self._peers())
         wire.hold_questions()
         try:
-            if under_way := {*self._answering.under_way, *self._asking.open} - {asyncio.current_task()}:
-                await asyncio.wait(under_way, timeout=QUIET_S)
+            under_way = {*self._answering.under_way, *self._asking.open} - {asyncio.current_task()}
+            quiet = wire.loop.time() + QUIET_S
+            # A stop that is given meanwhile goes to its robots at once, and its answer is waited for as well.
+            while pending := {each for each in {*under_way, *self._asking.urgent} if not each.done()}:
+                if (left_s := quiet - wire.loop.time()) <= 0:
+                    break
+                await asyncio.wait(pending, timeout=left_s)
             await wire.hold_all(QUIET_S)
             began = wire.loop.time()
             self._presence.all_held()

@@ -203,7 +203,8 @@ async def _send_stop(session: Session, robot: str, command: RobotCommand) -> Non
         command, id=f"{command.id[:150]}~stop{command.attempt}", verb="stop", args={"id": command.id}
     )
     try:
-        await session.query(session.keys(keyspace.COMMAND, robot), encode(stop), timeout_s=_STOP_TIMEOUT_S, sign=True)
+        key = session.keys(keyspace.COMMAND, robot)
+        await session.query(key, encode(stop), timeout_s=_STOP_TIMEOUT_S, sign=True, urgent=True)
     except SwiftbotError as error:
         log.warning("stop not delivered", robot=robot, id=command.id, error=str(error))
 
@@ -231,9 +232,8 @@ async def tell_to_hold(
         command = RobotCommand(id=f"{act}~{robot}"[:200], verb="stop")
         async with room:
             try:
-                answer = await session.query(
-                    session.keys(keyspace.COMMAND, robot), encode(command), timeout_s=timeout_s, sign=True
-                )
+                key, payload = session.keys(keyspace.COMMAND, robot), encode(command)
+                answer = await session.query(key, payload, timeout_s=timeout_s, sign=True, urgent=True)
                 reply = msgspec.json.decode(answer, type=RobotReply)
             except SwiftbotError as error:
                 return error.message

@@ -5,9 +5,10 @@ import asyncio
 import contextlib
 import socket
 import ssl
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from urllib.parse import urlsplit
 
+import msgspec
 import pytest
 import zenoh
 from cryptography import x509
@@ -15,13 +16,14 @@ from secured import FLEET, Secured, until
 
 from appliance.errors import SwiftbotError, UnreachableError
 from appliance.identity import certificates
-from appliance.model import keyspace
+from appliance.model import RobotCommand, RobotReply, encode, keyspace
 from appliance.model.keys import Keys
 from appliance.model.plane_api import FactsAsk, KeyAsk
 from appliance.model.roles import Role
 from appliance.plane import link, session
 from appliance.plane.events import Lost, Relinked, Stage
 from appliance.plane.session import Session
+from appliance.robots.sender import tell_to_hold
 
 pytestmark = pytest.mark.anyio
 
@@ -150,6 +152,46 @@ async def test_what_was_declared_before_is_there_after(fleet: Secured) -> None:
     assert alive[2:] == [(KEYS(keyspace.ROBOT_ALIVE, "r1"), False)]
     publisher.put(b"{}")
     publisher.close()
+
+
+async def test_a_stop_does_not_wait_for_the_session_to_be_reopened(
+    fleet: Secured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the gateway waits for what is under way, its robots are told to hold at once; other questions wait."""
+    monkeypatch.setattr(session, "QUIET_S", 30.0)
+    one, other = fleet.planes["g0"], fleet.planes["g1"]
+    done, order = asyncio.Event(), list[str]()
+
+    async def slow(_: str, payload: bytes) -> bytes:
+        await done.wait()
+        return payload
+
+    async def robot(_: str, payload: bytes) -> bytes:
+        return encode(RobotReply(id=msgspec.json.decode(payload, type=RobotCommand).id))
+
+    async def follow(what: str, work: Awaitable[object]) -> object:
+        answer = await work
+        order.append(what)
+        return answer
+
+    other.session.serve(KEYS(keyspace.COMMAND, "r2"), slow)
+    other.session.serve(KEYS(keyspace.COMMAND, "r1"), robot)
+    work = [asyncio.create_task(follow("slow", one.session.query(KEYS(keyspace.COMMAND, "r2"), b"", timeout_s=30.0)))]
+    await asyncio.sleep(0)
+    work.append(asyncio.create_task(follow("reopened", one._reopener.reopen("a test"))))
+    await until(lambda: one.session._wire.held)
+    state = encode(RobotCommand(id="1", verb="state"))
+    work.append(
+        asyncio.create_task(follow("state", one.session.query(KEYS(keyspace.COMMAND, "r1"), state, timeout_s=30.0)))
+    )
+    await asyncio.sleep(0)
+    held, problems = await tell_to_hold(one.session, ["r1"], act="s1", timeout_s=20.0)
+    order.append("stop")
+    done.set()
+    await asyncio.gather(*work)
+    assert (held, problems) == (("r1",), {})
+    assert order[:2] == ["stop", "slow"]
+    assert sorted(order[2:]) == ["reopened", "state"]
 
 
 async def test_a_robot_that_is_revoked_is_let_into_nothing(fleet: Secured) -> None:

@@ -36,7 +36,7 @@ class FakeSession:
         """Return a way to put a key."""
         return FakePublisher(self, key, encoding)
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool) -> bytes:  # noqa: ARG002
+    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool, urgent: bool = False) -> bytes:  # noqa: ARG002
         """Answer as `answer` does; robots are asked with a signature only."""
         assert sign
         self.queries.append(payload)

@@ -72,7 +72,7 @@ class FakeSession:
         """Count."""
         self.refused[what] = self.refused.get(what, 0) + 1
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool) -> bytes:
+    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool, urgent: bool = False) -> bytes:
         """Answer with the next prepared reply; the last one again and again. Robots are asked with a signature only."""
         assert sign
         self.queries.append(payload)

@@ -76,7 +76,7 @@ class FakePlane:
         """Return what is kept."""
         return [(key, value) for key, value in self.values.items() if key.startswith(prefix)]
 
-    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool) -> bytes:  # noqa: ARG002 - as a session
+    async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool, urgent: bool = False) -> bytes:  # noqa: ARG002 - as a session
         """Do it, or hold."""
         robot = next(each for each in self.registry.robots if self.keys(keyspace.COMMAND, each) == key)
         if robot in self.deaf:

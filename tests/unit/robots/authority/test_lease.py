@@ -100,7 +100,7 @@ async def test_a_robot_holds_before_its_tasks_have_it_again(
     holds = asyncio.Event()
     query = plane.query
 
-    async def slow(key: str, payload: bytes, *, timeout_s: float, sign: bool) -> bytes:
+    async def slow(key: str, payload: bytes, *, timeout_s: float, sign: bool, urgent: bool) -> bytes:
         await holds.wait()
         return await query(key, payload, timeout_s=timeout_s, sign=sign)
 
