@@ -34,7 +34,7 @@ from appliance.errors import (
     UnreachableError,
     from_code,
 )
-from appliance.llm.stop_words import stop_request
+from appliance.llm.stop_words import mentions_stop, stop_request
 from appliance.model import (
     Act,
     Enquiry,
@@ -902,6 +902,21 @@ class Stopped(Struct, frozen=True, kw_only=True):
         robots = meant.robots if len(meant.robots) <= MAX_STOPPED else ()
         answer = await client.stop(robots, why=why[:MAX_WHY]) if meant.robots or meant.fleet else None
         return Stopped(robots=robots, unknown=meant.unknown, roster=roster, answer=answer)
+
+    @staticmethod
+    async def by_words(client: SteeringCalls, text: str) -> "Stopped | None":
+        """Carry an instruction out that says to stop; None when it does not. Errors as `carry_out`."""
+        if not mentions_stop(text):
+            return None
+        there = False
+        with contextlib.suppress(UnreachableError):
+            await client.gateway()
+            there = True
+        if (stop := stop_request(text, roster_of(client))) is None:
+            return None
+        # Without a gateway the names are unknown: then all robots that hear it stop.
+        names = (*stop.robots, *(stop.unknown if there else ()))
+        return await Stopped.carry_out(client, names, why=text)
 
     @property
     def confirmed(self) -> bool:

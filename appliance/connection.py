@@ -5,6 +5,7 @@ this machine are found by its state file.
 """
 
 import asyncio
+import copy
 import difflib
 import os
 import time
@@ -70,6 +71,13 @@ class FleetConnection:
             # Gateways go by that name; it is shown and put as they will have it.
             self.operator, self.role = credentials.identity.name, credentials.identity.role
         return self
+
+    def acting(self, operator: str) -> Self:
+        """Return this connection, open as it is, under another name; with keys it is the certificate's all the same."""
+        other = copy.copy(self)
+        if self.role is None:
+            other.operator = operator[:MAX_BY]
+        return other
 
     async def close(self) -> None:
         """Disconnect, unless that was done."""

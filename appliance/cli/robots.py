@@ -40,24 +40,29 @@ def add_to(app: App) -> None:
 @robots_app.command(name="list")
 async def robots_list(*, as_json: Json = False, where: Where = HERE) -> int:
     """List the robots: whether each is online, stopped, or taken over. Exit code 1: stops are not known."""
-    unsure = ""
     async with where.client() as client:
         await client.gateway()
-        try:
-            standing = await client.standing()
-            closures = (await client.closures()).closures
-        except SwiftbotError as error:
-            standing, closures, unsure = None, (), error.message
-        robots = sorted(client.plane.registry.robots.values(), key=lambda each: each.id)
-    kept_out = {each.name: each.text for each in closures if each.kind == "robot"}
-    found = [replace(robot_shown(each, standing), maintenance=kept_out.get(each.id)) for each in robots]
+        found, unsure = await robots_now(client)
     held = {each.id: "; ".join(filter(None, (each.stopped, each.taken_over, each.maintenance))) for each in found}
     if unsure:
         held = dict.fromkeys(held, "stops not known")
-    show(found, as_json=as_json, table=console.robot_table(robots, held))
+    show(found, as_json=as_json, table=console.robot_table(found, held))
     if unsure:
         console.err.print(f"which robots are stopped or taken over is not known: {unsure}", markup=False)
     return Exit.FAILED if unsure else Exit.DONE
+
+
+async def robots_now(client: FleetClient) -> tuple[list["RobotShown"], str]:
+    """Return the robots by name with what holds each; and why that is not known, where no gateway answered that."""
+    unsure = ""
+    try:
+        standing = await client.standing()
+        closures = (await client.closures()).closures
+    except SwiftbotError as error:
+        standing, closures, unsure = None, (), error.message
+    robots = sorted(client.plane.registry.robots.values(), key=lambda each: each.id)
+    kept_out = {each.name: each.text for each in closures if each.kind == "robot"}
+    return [replace(robot_shown(each, standing), maintenance=kept_out.get(each.id)) for each in robots], unsure
 
 
 class RobotShown(RobotInfo, frozen=True, kw_only=True):

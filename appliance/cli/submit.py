@@ -5,7 +5,6 @@ step by itself: between two of them a person is asked, and Ctrl-C must end the q
 """
 
 import asyncio
-import contextlib
 import os
 import shlex
 import subprocess
@@ -23,10 +22,10 @@ from msgspec.structs import replace
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, on_terminal, show
 from appliance.cli.stop import reported_unconfirmed, show_stopped
-from appliance.client import FleetClient, Stopped, read_plan_file, roster_of
+from appliance.client import FleetClient, Stopped, read_plan_file
 from appliance.connection import operator_name
-from appliance.errors import Exit, NotFoundError, SwiftbotError, UnapprovedError, UnreachableError
-from appliance.llm.stop_words import mentions_stop, stop_request
+from appliance.errors import Exit, NotFoundError, SwiftbotError, UnapprovedError
+from appliance.llm.stop_words import stop_request
 from appliance.model import PLAIN_PRIORITY, Approval, Plan, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.tasks.views import view
 
@@ -196,7 +195,7 @@ class Submitting:
 
     async def _run(self) -> TaskRecord | Stopped:
         async with self._where.client() as client:
-            if (stopped := await self._stopped(client)) is not None:
+            if (stopped := await Stopped.by_words(client, self._request.instruction)) is not None:
                 return stopped
             try:
                 accepted = await client.submit(self._request)
@@ -217,7 +216,7 @@ class Submitting:
 
     async def _propose(self) -> TaskRecord | Stopped:
         async with self._where.client() as client:
-            if (stopped := await self._stopped(client)) is not None:
+            if (stopped := await Stopped.by_words(client, self._request.instruction)) is not None:
                 return stopped
             try:
                 with console.err.status("planning"):
@@ -226,21 +225,6 @@ class Submitting:
             except asyncio.CancelledError:
                 await self._cancel(client)
                 raise
-
-    async def _stopped(self, client: FleetClient) -> Stopped | None:
-        """Carry the instruction out when it is a stop."""
-        text = self._request.instruction
-        if not mentions_stop(text):
-            return None
-        there = False
-        with contextlib.suppress(UnreachableError):
-            await client.gateway()
-            there = True
-        if (stop := stop_request(text, roster_of(client))) is None:
-            return None
-        # Without a gateway the names are unknown: then all robots that hear it stop.
-        names = (*stop.robots, *(stop.unknown if there else ()))
-        return await Stopped.carry_out(client, names, why=text)
 
     async def _approve(self, plan_hash: str, edited: Plan | None) -> TaskRecord:
         async with self._where.client() as client:

@@ -21,7 +21,7 @@ def leaves(parent: App, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 
 COMMANDS = dict(leaves(cli.app))
 SILENT = {
-    "tui", "gateway", "router", "record", "foxglove", "up", "demo", "sim mavlink", "sim zenoh", "train fit",
+    "tui", "gateway", "router", "record", "foxglove", "mcp", "up", "demo", "sim mavlink", "sim zenoh", "train fit",
     "train export", "train tune", "robots qgc-actions", "completion",
 }  # fmt: skip
 """Commands that print no data of their own, or a file as it is."""

@@ -52,6 +52,7 @@ OBEYED = frozenset("\x1b\x9b\x07\x08\x7f\u202e\u2066")
 CODES = frozenset(Exit)
 CHECKED_FIRST = {
     "gateway": "--config", "router": "--listen", "record": "--config", "foxglove": "--config", "tui": "--theme",
+    "mcp": "--port",
 }  # fmt: skip
 """Daemons, and the option by which a wrong word ends them before anything is started."""
 WORKSHOP = frozenset({"up", "down", "demo", "bench", "train", "sim"})
@@ -279,10 +280,10 @@ def takes_path(command: App) -> bool:
 
 
 def test_each_command_that_takes_a_path_is_tried_with_some() -> None:
-    """None is missing in the table, but what would fill a folder with data."""
+    """None is missing in the table, but what would fill a folder with data, or serve once its path is good."""
     tried = {words for words in COMMANDS for line in WITH_PATHS if line.startswith(" ".join(words) + " ")}
     missing = {" ".join(words) for words, command in COMMANDS.items() if takes_path(command) and words not in tried}
-    assert missing == {"learn data make"}
+    assert missing == {"learn data make", "mcp"}
 
 
 class Unattended(host.Machine):
