@@ -17,6 +17,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from appliance.identity.parts import DEVELOPMENT
 from appliance.model import (
     PLAIN_PRIORITY,
     ContainerInfo,
@@ -461,6 +462,8 @@ def fleet_view(gateways: Sequence[GatewayStatus], lost: Mapping[str, int] | None
     """
     notes = together(note for each in gateways for note in each.recorders)
     lines = [Text(f"! {text}", style="yellow") for note in notes if (text := recorder_text(note))]
+    if any(each.parts == DEVELOPMENT for each in gateways):
+        lines.append(Text(DEVELOPMENT, style="dim"))
     return Group(gateway_table(gateways, lost), *lines)
 
 
@@ -484,6 +487,8 @@ def gateway_table(gateways: Sequence[GatewayStatus], lost: Mapping[str, int] | N
             state += f", {each.site_problem}"
         if each.keys_problem:
             state += f", {each.keys_problem}"
+        if each.parts_problem:
+            state += f", {each.parts_problem}"
         table.add_row(
             each.id,
             f"{each.load:.0%}",

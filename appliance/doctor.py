@@ -31,12 +31,14 @@ from msgspec import Struct
 
 from appliance.config import GatewayConfig
 from appliance.errors import SwiftbotError
+from appliance.identity.parts import DEVELOPMENT, InForce, Kind
 from appliance.llm.settings import folder_of
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import LIMITING, ContainerSpec, Engine, EngineFacts, PodmanEngine
 from appliance.pool.images import build_command, reference
 from appliance.pool.settings import PoolConfig
+from appliance.pool.signed import without_unsigned
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from appliance.skills.sites import load_site
 
@@ -577,6 +579,28 @@ def check_keys(plane: PlaneConfig, gateway: str, fleet: str, now: float) -> Chec
     )
 
 
+def check_parts(config: GatewayConfig) -> Check:
+    """The signed list of parts, and whether the skills and the model of this machine are in it."""
+    if not config.plane.keys:
+        return Check(name="parts", ok=True, detail=DEVELOPMENT, required=False)
+    from appliance.identity.bundle import Bundle  # noqa: PLC0415 - as in check_keys
+
+    try:
+        in_force = InForce.beside(Bundle.load(Path(config.plane.keys).expanduser()), config.plane.parts_file)
+        without_unsigned(_catalogue(config), in_force)
+        if (model := Path(folder_of(config.llm.local_model))).is_dir() and config.llm.local_model:
+            in_force.check_folder(Kind.MODEL, model)
+    except SwiftbotError as error:
+        return Check(name="parts", ok=False, detail=error.message, remedy=error.remedy)
+    problem = in_force.problem
+    return Check(
+        name="parts",
+        ok=not problem,
+        detail=problem or f"{in_force.text}: skills and model are signed",
+        remedy="sign what is to run: docs/security.md, Signed parts",
+    )
+
+
 async def check_session(open_session: Callable[[], Awaitable[Session]]) -> Check:
     """Open a Zenoh session on the loopback and have it answer itself."""
     try:
@@ -616,6 +640,7 @@ def local_checks(machine: Machine, config: GatewayConfig | None) -> list[Check]:
         folders += [Path(config.data_dir).expanduser(), config.record.folder]
         checks += check_ports(machine, config)
         checks.append(check_keys(config.plane, config.id, config.fleet, machine.now()))
+        checks.append(check_parts(config))
     checks += check_disk(machine, folders)
     checks.append(check_model(machine, config.llm.local_model if config else ""))
     checks.append(check_fence(config.site if config else "warehouse"))

@@ -31,6 +31,8 @@ from appliance.closures import keeper as closures
 from appliance.closures.keeper import Closures
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, PrerequisiteError
+from appliance.identity.parts import ALL, DEVELOPMENT, InForce, Kind
+from appliance.identity.parts import FILE as PARTS_FILE
 from appliance.learn import records as learn_records
 from appliance.learn.manager import LearnManager
 from appliance.llm.cascade import Decomposer
@@ -59,6 +61,7 @@ from appliance.pool.images import reference
 from appliance.pool.pool import Pool
 from appliance.pool.selection import UNMEASURED, Link
 from appliance.pool.settings import PoolConfig
+from appliance.pool.signed import without_unsigned
 from appliance.pool.volumes import ALONE, State
 from appliance.pool.volumes.registry import Volumes
 from appliance.pool.volumes.transfers import Transfers
@@ -112,8 +115,16 @@ class StateHere:
     """The ledger of state volumes, and the transfers of them and of images; `open` it, `close` it in any case."""
 
     def __init__(
-        self, config: PoolConfig, *, plane: Plane, fleet: str, data_dir: Path, on_change: Callable[[], None]
+        self,
+        config: PoolConfig,
+        *,
+        plane: Plane,
+        fleet: str,
+        data_dir: Path,
+        on_change: Callable[[], None],
+        parts: InForce = ALL,
     ) -> None:
+        self._parts = parts
         self.state: State = ALONE
         """What the pool may do with state; nothing without Podman."""
         self._config = config
@@ -150,8 +161,9 @@ class StateHere:
         self._stack.push_async_callback(volumes.close)
         self._stack.callback(plane.events.subscribe(Stage.VOLUMES, self._on_event))
         self._transfers = transfers = Transfers(
-            settings, plane=plane, volumes=volumes, storage=storage, data_dir=self._data, on_change=self._on_change
-        )
+            settings, plane=plane, volumes=volumes, storage=storage, data_dir=self._data, on_change=self._on_change,
+            parts=self._parts,
+        )  # fmt: skip
         await transfers.start(signed)
         self._stack.push_async_callback(transfers.close)
         self.state = State(
@@ -230,6 +242,7 @@ class Gateway:
         """The last lines about tasks that this gateway has said."""
         self._site_problem = ""
         self._recorders = Recorders()
+        self._parts = ALL
 
     async def start(self) -> None:
         """Build and start every part; on failure, what was started is stopped again and the error raised."""
@@ -251,6 +264,7 @@ class Gateway:
         logs.publish_to(self._put_log)
         self._stack.callback(logs.publish_to, None)
         await self.plane.until_back()
+        catalogue = await self._take_parts(catalogue)
 
         await self._start_planner(catalogue)
 
@@ -288,8 +302,9 @@ class Gateway:
             orders=orders.held,
         )
         self._storage = storage = StateHere(
-            config.pool, plane=self.plane, fleet=config.fleet, data_dir=self._data, on_change=self._changed.set
-        )
+            config.pool, plane=self.plane, fleet=config.fleet, data_dir=self._data, on_change=self._changed.set,
+            parts=self._parts,
+        )  # fmt: skip
         self._stack.push_async_callback(storage.close)
         await storage.open(audit.signed)
         self._remote = remote = RemoteContainers(self.plane, successors=config.plane.find_successors, link=storage.link)
@@ -311,6 +326,7 @@ class Gateway:
             state=storage.state,
             store=self.plane.store,
             on_decided=self._tell_decided,
+            parts=self._parts,
         )
         reservations = Reservations(config.id, self.pool)
         self.executor = Executor(
@@ -484,7 +500,7 @@ class Gateway:
 
         peers = PeerTier(config.llm, gateways=gateways, ask=ask, here=config.id)
         self.decomposer = Decomposer(
-            config.llm, catalogue, safety=config.safety, gateway=config.id, peers=peers
+            config.llm, catalogue, safety=config.safety, gateway=config.id, peers=peers, check_model=self._check_model
         )  # fmt: skip
         memory = self.decomposer.memory
         await memory.load(plane.store)
@@ -510,6 +526,18 @@ class Gateway:
     def _load(self) -> tuple[Catalogue, Site]:
         catalogue = load_catalogue(tuple(Path(each).expanduser() for each in self.config.skills))
         return catalogue, load_site(self.config.site)
+
+    async def _take_parts(self, catalogue: Catalogue) -> Catalogue:
+        """Take up the signed list of parts; returns the catalogue without the skills that may not run."""
+        credentials = self.plane.session.credentials
+        if credentials is None:
+            log.warning(DEVELOPMENT)
+            return catalogue
+        self._parts = InForce.beside(credentials.bundle, self.config.plane.parts_file, kept=self._data / PARTS_FILE)
+        return await asyncio.to_thread(without_unsigned, catalogue, self._parts)
+
+    def _check_model(self, folder: Path) -> None:
+        self._parts.check_folder(Kind.MODEL, folder)
 
     def _make_directories(self) -> None:
         for directory in (self._data, self._run_dir()):
@@ -633,6 +661,8 @@ class Gateway:
             pool_problem=self.pool.problem or self.pool.squeeze,
             site_problem=self._site_problem,
             keys_problem=credentials.problem(time.time()) if credentials is not None else "",
+            parts=self._parts.text,
+            parts_problem=self._parts.problem,
             images=self._storage.images(),
             volumes=self._storage.volumes(),
             models=self.decomposer.models,

@@ -1,10 +1,14 @@
 """Keys of a fleet that lives for one run: an authority of its own, and a file for each member."""
 
+import asyncio
 import shutil
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 
+from appliance.config import GatewayConfig
+from appliance.deploy import parts
 from appliance.identity.authority import Authority
 from appliance.model.roles import Role
 
@@ -34,3 +38,10 @@ def issue(folder: Path, fleet: str, *, gateways: Mapping[str, str], robots: Iter
         authority.issue(Role.ROBOT, robot, out=file_of(folder, Role.ROBOT, robot))
     for name, host in gateways.items():
         authority.issue(Role.GATEWAY, name, out=file_of(folder, Role.GATEWAY, name), hosts=(host,))
+
+
+def sign_parts(folder: Path, config: GatewayConfig) -> None:
+    """Sign all images, skills and models that are on this machine for gateways of this configuration; blocks."""
+    with ThreadPoolExecutor(max_workers=1) as thread:  # there may be a loop in this one
+        found = thread.submit(asyncio.run, parts.collect(config)).result()
+    parts.sign(Authority.load(folder), [found])

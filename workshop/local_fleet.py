@@ -172,6 +172,8 @@ class _Starting:
             path = directory / name / "gateway.toml"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(configuration.dump(config))
+            if order.secured and not index:
+                keyring.sign_parts(keys_folder(directory), config)
             self._spawn(name, "gateway", "--config", str(path))
         self._spawn("recorder", "record", "--config", str(directory / names[0] / "gateway.toml"))
         for number, drone in enumerate(drones):

@@ -122,6 +122,8 @@ def _gateways(facts: Facts) -> Iterator[Finding]:
             yield of("site", WARNING, status.site_problem, "add [fence] to the site's file")
         if status.keys_problem:
             yield of("keys", WARNING, status.keys_problem, "`swiftbot keys list`, then `swiftbot keys renew ROLE NAME`")
+        if status.parts_problem:
+            yield of("parts", WARNING, status.parts_problem, "`swiftbot parts check` there; then sign what is to run")
         if status.disk_total_mb and status.disk_free_mb < DISK_WARNING_MB:
             level = CRITICAL if status.disk_free_mb < DISK_CRITICAL_MB else WARNING
             what = f"{status.disk_free_mb:,} MiB free of {status.disk_total_mb:,} on the disk of its data"

@@ -264,7 +264,14 @@ class _Writing:
 
 def named_in(config: GatewayConfig) -> Iterator[Path]:
     """Yield what a configuration names of its own: keys, rosters, site, skills, a local model."""
-    named = [config.plane.keys, config.plane.roster, config.record.keys, config.site, *config.skills]
+    named = [
+        config.plane.keys,
+        config.plane.roster,
+        config.plane.parts,
+        config.record.keys,
+        config.site,
+        *config.skills,
+    ]
     named += [config.llm.local_model, config.llm.upstream_key_file]
     named += [link.signing for link in config.robots.mavlink]
     for each in named:

@@ -12,10 +12,12 @@ from pathlib import Path
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from msgspec.structs import replace
 
 from appliance.errors import ConfigError, ConflictError, IdentityError, NotFoundError, PayloadError
-from appliance.identity import certificates, files, roster
+from appliance.identity import certificates, files, parts, roster
 from appliance.identity.bundle import Bundle, private_text
+from appliance.identity.parts import Parts
 from appliance.identity.roster import Issued, Roster
 from appliance.model.keys import check_name
 from appliance.model.roles import Role
@@ -189,6 +191,28 @@ class Authority:
                 raise NotFoundError(f"{role} {name} has no valid certificate", remedy="swiftbot keys list shows all")
             self._keep(self.roster.revoke(role, name, now=at, why=why))
             return tuple(each for each in self.roster.issued if each.serial in {one.serial for one in valid})
+
+    def sign_parts(self, listed: Parts, out: Path | None = None, now: datetime | None = None) -> Parts:
+        """Sign the fleet's next list of parts, in place of the one before; returns it with its number.
+
+        Args:
+            listed: the parts.
+            out: a file to write it to as well.
+            now: when that is.
+
+        Raises:
+            IdentityError: the one before is damaged, or a file cannot be written.
+        """
+        file = self.folder / parts.FILE
+        with files.locked(self.folder):
+            before = parts.unseal(parts.read(file), self._key.public_key(), self.fleet) if file.exists() else Parts()
+            signed = (now or datetime.now(UTC)).timestamp()
+            made = replace(listed, fleet=self.fleet, number=before.number + 1, signed=signed)
+            data = parts.seal(made, self._key)
+            files.write(file, data, mode=files.PUBLIC)
+            if out is not None:
+                files.write(out, data, mode=files.PUBLIC)
+        return made
 
     def _issue(
         self, role: Role, name: str, *, out: Path, hosts: Sequence[str], days: int, now: datetime, replace: bool

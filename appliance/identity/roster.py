@@ -5,20 +5,17 @@ and of two copies the one with the higher number counts. A certificate that is n
 the roster is concerned: the authority's signature on it says so. What the roster takes away is taken away at once.
 """
 
-import base64
-
 import msgspec
-from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import IdentityError
+from appliance.identity import sealed
 from appliance.identity.member import Identity
 from appliance.model.roles import Role
 
-_DOMAIN = b"swiftbot roster 1\0"
-"""Before what is signed, so that a signature of something else is none of a roster."""
+_NAME = "roster"
 MOST_BYTES = 4 * 2**20
 """Of a roster file; 10,000 certificates are about 2.5 MB."""
 
@@ -83,18 +80,9 @@ class Roster(Struct, frozen=True, kw_only=True):
             )
 
 
-class _File(Struct, frozen=True):
-    """A roster as it is kept and sent: the text that is signed, and its signature in base64."""
-
-    roster: str
-    signature: str
-
-
 def seal(roster: Roster, key: Ed25519PrivateKey) -> bytes:
     """Sign a roster with the authority's key; what comes out is its file."""
-    text = msgspec.json.encode(roster)
-    signature = base64.b64encode(key.sign(_DOMAIN + text)).decode()
-    return msgspec.json.format(msgspec.json.encode(_File(text.decode(), signature)))
+    return sealed.seal(_NAME, msgspec.json.encode(roster), key)
 
 
 def unseal(data: bytes, authority: Ed25519PublicKey, fleet: str) -> Roster:
@@ -103,20 +91,11 @@ def unseal(data: bytes, authority: Ed25519PublicKey, fleet: str) -> Roster:
     Raises:
         IdentityError: it is damaged, of another fleet, or another authority signed it.
     """
-    if len(data) > MOST_BYTES:
-        raise IdentityError(f"the roster has {len(data):,} bytes", remedy=f"at most {MOST_BYTES:,}")
+    text = sealed.unseal(_NAME, data, authority, most=MOST_BYTES)
     try:
-        file = msgspec.json.decode(data, type=_File)
-        authority.verify(base64.b64decode(file.signature, validate=True), _DOMAIN + file.roster.encode())
-        roster = msgspec.json.decode(file.roster, type=Roster)
-    except InvalidSignature:
-        raise IdentityError(
-            "the roster is changed, or another authority signed it", remedy="copy it again from the authority"
-        ) from None
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # ValueError: no base64, no UTF-8
-        raise IdentityError(
-            f"the roster is damaged or cut off: {error}", remedy="copy it again from the authority"
-        ) from None
+        roster = msgspec.json.decode(text, type=Roster)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise sealed.damaged(_NAME, error) from None
     if roster.fleet != fleet:
         raise IdentityError(f"the roster is of fleet {roster.fleet}, not {fleet}", remedy="copy the right one")
     return roster

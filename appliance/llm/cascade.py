@@ -13,6 +13,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -151,6 +152,7 @@ class Decomposer:
         gateway: str = "",
         peers: Planner | None = None,
         slots: Sequence[Slot] | None = None,
+        check_model: Callable[[Path], None] = lambda _: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Build the tiers that the configuration names.
@@ -162,6 +164,7 @@ class Decomposer:
             gateway: this one, for the plans' provenance.
             peers: the tier that asks other gateways.
             slots: tiers in place of the configured ones; the seam for tests and measurements.
+            check_model: raises IdentityError where a model's folder may not be loaded.
             clock: seconds, for what is remembered.
 
         Raises:
@@ -179,8 +182,11 @@ class Decomposer:
             price_in=config.upstream_price_in,
             price_out=config.upstream_price_out,
         )
+        self._check_model = check_model
         given = None if slots is None else tuple(slots)
-        self._slots = configured(config, catalogue, peers, self._pay, self._safety) if given is None else given
+        self._slots = (
+            configured(config, catalogue, peers, self._pay, self._safety, check_model) if given is None else given
+        )
         self._privacy = Privacy(
             never=config.upstream_never, robots=config.upstream_never_robots, tag=config.upstream_private_tag
         )
@@ -254,7 +260,7 @@ class Decomposer:
         if self._changing.locked():
             raise RefusedError("another model is being loaded already", remedy="wait until that is done")
         async with self._changing:
-            self._slots, swapped = await swap(self._slots, folder, self._config, self._catalogue)
+            self._slots, swapped = await swap(self._slots, folder, self._config, self._catalogue, self._check_model)
         return swapped
 
     async def propose(self, ask: ProposeAsk) -> Proposed:

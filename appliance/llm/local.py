@@ -18,7 +18,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from msgspec.structs import replace
 from appliance.errors import (
     ConfigError,
     DeadlineError,
+    IdentityError,
     PlanError,
     PrerequisiteError,
     RefusedError,
@@ -67,10 +68,12 @@ class ModelProcess:
     Args:
         folder: of an onnxruntime-genai model.
         config: threads, bounds and deadlines.
+        check: raises IdentityError where the folder may not be loaded; asked before each start.
     """
 
-    def __init__(self, folder: str, config: LlmConfig) -> None:
+    def __init__(self, folder: str, config: LlmConfig, check: Callable[[Path], None] = lambda _: None) -> None:
         self.folder = folder
+        self._check = check
         self._config = config
         self._process: asyncio.subprocess.Process | None = None
         self._keeper: asyncio.Task[None] | None = None
@@ -163,7 +166,11 @@ class ModelProcess:
         while True:
             began = time.monotonic()
             try:
+                await asyncio.to_thread(self._check, Path(self.folder))
                 await self._live()
+            except (IdentityError, ConfigError) as error:
+                self.problem = error
+                self._settled.set()
             except OSError as error:  # no memory, no descriptors, no more processes: tried again like an end
                 self.problem = UnreachableError(
                     f"the local model's process cannot be started: {error}",
@@ -321,11 +328,18 @@ class LocalTier:
 
     name = Tier.LOCAL
 
-    def __init__(self, config: LlmConfig, catalogue: Catalogue, safety: SafetyConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: LlmConfig,
+        catalogue: Catalogue,
+        safety: SafetyConfig | None = None,
+        check_model: Callable[[Path], None] = lambda _: None,
+    ) -> None:
         self._config = config
+        self._check_model = check_model
         self._safety = safety or SafetyConfig()
         self._catalogue = catalogue
-        self._process = ModelProcess(folder_of(config.local_model), config)
+        self._process = ModelProcess(folder_of(config.local_model), config, check_model)
         self._turn = asyncio.Lock()
         self._shapes = shapes(catalogue)
         self._inside = 0
@@ -439,7 +453,7 @@ class LocalTier:
         if self._swapping:
             raise RefusedError("another model is being loaded already", remedy="wait until that is done")
         self._swapping = True
-        other = ModelProcess(folder_of(folder), self._config)
+        other = ModelProcess(folder_of(folder), self._config, self._check_model)
         try:
             told = await self._tried(other)
             async with self._turn:
@@ -669,7 +683,11 @@ def _memory_mb(pid: int | None) -> float:
 
 
 async def swap(
-    slots: Sequence[Slot], folder: str, config: LlmConfig, catalogue: Catalogue
+    slots: Sequence[Slot],
+    folder: str,
+    config: LlmConfig,
+    catalogue: Catalogue,
+    check_model: Callable[[Path], None] = lambda _: None,
 ) -> tuple[tuple[Slot, ...], Swapped]:
     """Have the local tier use another model; returns the tiers from then on.
 
@@ -686,7 +704,7 @@ async def swap(
         tests = await here.swap(folder)
         after = tuple(slots)
     else:
-        before, slot = "", local(replace(config, local_model=folder), catalogue)
+        before, slot = "", local(replace(config, local_model=folder), catalogue, check_model=check_model)
         planner = slot.planner
         assert isinstance(planner, LocalTier)  # noqa: S101 - `local` makes nothing else
         try:

@@ -1,6 +1,7 @@
 """The tiers that the configuration names, with the cascade's terms for each."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 from msgspec import Struct
 
@@ -29,6 +30,7 @@ def configured(
     peers: Planner | None,
     pay: Callable[[], tuple[Budget, Callable[[], None]]],
     safety: SafetyConfig,
+    check_model: Callable[[Path], None] = lambda _: None,
 ) -> tuple[Slot, ...]:
     """Return the tiers of a configuration, in order of asking.
 
@@ -38,11 +40,12 @@ def configured(
         peers: the tier that asks other gateways; None where there are none.
         pay: what upstream may cost, and whom to tell that it did.
         safety: the policy that the local tier chooses its answers by.
+        check_model: raises IdentityError where a model's folder may not be loaded.
     """
     slots: list[Slot] = []
     for name in config.tiers:
         if name == Tier.LOCAL and config.local_model:
-            slots.append(local(config, catalogue, safety))
+            slots.append(local(config, catalogue, safety, check_model))
         elif name == Tier.PEER and peers is not None:
             slots.append(
                 Slot(
@@ -73,12 +76,17 @@ def configured(
     return tuple(slots)
 
 
-def local(config: LlmConfig, catalogue: Catalogue, safety: SafetyConfig | None = None) -> Slot:
+def local(
+    config: LlmConfig,
+    catalogue: Catalogue,
+    safety: SafetyConfig | None = None,
+    check_model: Callable[[Path], None] = lambda _: None,
+) -> Slot:
     """Return the local tier for `config.local_model`."""
     from appliance.llm.local import LocalTier  # noqa: PLC0415 - a gateway without model must not pay for it
 
     return Slot(
-        planner=LocalTier(config, catalogue, safety),
+        planner=LocalTier(config, catalogue, safety, check_model),
         deadline_s=config.local_deadline_s,
         max_words=config.local_max_words,
     )

@@ -209,6 +209,10 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """What the site's map lacks to keep robots on it, such as a fence; empty when all is well."""
     keys_problem: str = ""
     """What is to be done about certificates soon, such as one that expires; empty when nothing is."""
+    parts: str = ""
+    """Which signed list of parts it goes by, in words, or that it checks none (development mode)."""
+    parts_problem: str = ""
+    """Images, skills and models that it refuses since they are not in that list; empty when there are none."""
     images: tuple[str, ...] = ()
     """References of the images it has and can give to others."""
     volumes: tuple[VolumeInfo, ...] = ()

@@ -30,6 +30,9 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     roster: str = ""
     """The authority's roster: which robots there are, and which certificates are revoked. Empty: `roster.json` in the
     folder of `keys`."""
+    parts: str = ""
+    """The authority's list of parts: which images, skills and models may be fetched, loaded and run. Empty:
+    `parts.json` in the folder of `keys`. Without keys nothing is checked."""
     connect: tuple[str, ...] = ()
     """Endpoints to keep linked to: of routers, or of gateways that name nobody in `connect` themselves. Gossip finds
     the others, but a single cut link is redialled only where it is named. Gateways that know each other belong into
@@ -139,6 +142,11 @@ class PlaneConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                 remedy="`swiftbot keys init` and `swiftbot keys issue gateway NAME --host ADDRESS` make keys; or use "
                 "127.0.0.1",
             )
+
+    @property
+    def parts_file(self) -> Path:
+        """Where the list of parts is; of no meaning without keys."""
+        return Path(self.parts or Path(self.keys).parent / "parts.json").expanduser()
 
     @property
     def roster_file(self) -> Path:

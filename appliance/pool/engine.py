@@ -109,6 +109,8 @@ class Found(Struct, frozen=True, kw_only=True):
     name: str
     running: bool
     labels: dict[str, str]
+    image: str = ""
+    """Id of its image."""
 
 
 class FoundImage(Struct, frozen=True, kw_only=True):
@@ -187,6 +189,10 @@ class Engine(Protocol):
 
     async def images(self) -> list[FoundImage]:
         """Return all images with a tag of ours."""
+        ...
+
+    async def image(self, reference: str) -> ImageFacts:
+        """Return what an image is made of; NotFoundError when it is not there."""
         ...
 
     async def ensure_volume(self, name: str, labels: Mapping[str, str]) -> None:
@@ -407,6 +413,7 @@ class PodmanEngine:
                     id=each["Id"],
                     name=(each.get("Names") or [""])[0],
                     running=each.get("State") == "running",
+                    image=str(each.get("ImageID", "")).removeprefix("sha256:"),
                     labels=each.get("Labels") or {},
                 )
                 for each in response.json()

@@ -27,6 +27,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import ConfigError, NotFoundError, PayloadError, RefusedError, SwiftbotError
+from appliance.identity.parts import ALL, InForce
 from appliance.model import (
     ContainerInfo,
     ContainerState,
@@ -261,6 +262,7 @@ class Pool:
         on_decided: Callable[[Struct, str], None] = lambda _case, _what: None,
         make_engine: Callable[[], Engine] | None = None,
         read_memory: Callable[[], Reading] | None = None,
+        parts: InForce = ALL,
     ) -> None:
         known = ", ".join(sorted(catalogue.images))
         for image in config.floor:
@@ -286,6 +288,7 @@ class Pool:
                 refused=self.refused,
                 on_death=on_death,
                 state=state,
+                parts=parts,
             )
 
         self._keeper = ContainerManager(

@@ -20,12 +20,13 @@ import py_compile
 import secrets
 import shutil
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 from msgspec import Struct
 
 from appliance.errors import ConfigError
+from appliance.identity.parts import listing_digest, regular_files
 
 
 def add_bytecode(tree: Path, *, inside: Path | None = None) -> None:
@@ -54,8 +55,6 @@ def add_bytecode(tree: Path, *, inside: Path | None = None) -> None:
             continue
 
 
-LEFT_OUT = frozenset({"__pycache__", ".git", ".hg", ".svn"})
-"""Names that are no part of a skill wherever they are."""
 NOT_LOADED = frozenset({"images", "sites"})
 """Folders beside the skills of which a container loads nothing."""
 ATTEMPTS = 3
@@ -69,6 +68,23 @@ class Snapshot(Struct, frozen=True, kw_only=True):
     digest: str
     folder: Path
     files: dict[str, str]
+    left_out: frozenset[str] = frozenset()
+    """Parts that it lacks since they may not be used: `ROOT/PART`."""
+
+
+def _part(path: str) -> str:
+    """Return the part that a file of a folder of skills belongs to: the folder directly in it, or `.`."""
+    first, slash, _ = path.partition("/")
+    return first if slash else "."
+
+
+def part_digests(files: Mapping[str, str]) -> dict[str, str]:
+    """Return the digest of each part of a folder of skills, of the digests of its files."""
+    parts: dict[str, dict[str, str]] = {}
+    for path, digest in files.items():
+        part = _part(path)
+        parts.setdefault(part, {})[path.removeprefix(f"{part}/")] = digest
+    return {part: listing_digest(digests) for part, digests in parts.items()}
 
 
 def unexpected(loaded: Mapping[str, str], files: Mapping[str, str]) -> tuple[str, ...]:
@@ -83,8 +99,14 @@ class Snapshots:
         self._objects = store / "objects"
         self._trees = store / "trees"
 
-    def take(self, roots: Mapping[str, Path]) -> Snapshot:
+    def take(
+        self, roots: Mapping[str, Path], may: Callable[[str, str, str], bool] = lambda _root, _part, _digest: True
+    ) -> Snapshot:
         """Return a snapshot of folders, by the name that each has in it; what is stored already is linked.
+
+        Args:
+            roots: the folders.
+            may: whether a part of one, of that digest, may be in it.
 
         Raises:
             ConfigError: a folder cannot be read, or the store cannot be written.
@@ -96,7 +118,7 @@ class Snapshots:
                     _remove(left)
             for attempt in range(1, ATTEMPTS + 1):
                 try:
-                    return self._take(roots)
+                    return self._take(roots, may)
                 except FileNotFoundError:
                     if attempt == ATTEMPTS:
                         raise
@@ -107,20 +129,23 @@ class Snapshots:
             ) from error
         raise AssertionError("unreachable")
 
-    def _take(self, roots: Mapping[str, Path]) -> Snapshot:
+    def _take(self, roots: Mapping[str, Path], may: Callable[[str, str, str], bool]) -> Snapshot:
         building = self._trees / f"{_NEW}{secrets.token_hex(6)}"
         objects: dict[str, str] = {}
+        left_out: set[str] = set()
         try:
             for name, root in roots.items():
                 (building / name).mkdir(parents=True)
-                for file, path in _files(root):
-                    stored = self._store(file)
-                    objects[f"{name}/{path}"] = stored
-                    place = building / name / path
-                    place.parent.mkdir(parents=True, exist_ok=True)
-                    os.link(self._objects / stored, place)
-            listing = "".join(f"{path}\0{stored}\n" for path, stored in sorted(objects.items()))
-            digest = hashlib.sha256(os.fsencode(listing)).hexdigest()
+                stored = {path: self._store(file) for file, path in regular_files(root, left_out=NOT_LOADED)}
+                # Judged by the bytes that were stored: an edit after that is in no snapshot.
+                refused = {part for part, digest in part_digests(stored).items() if not may(name, part, digest)}
+                left_out.update(f"{name}/{part}" for part in refused)
+                objects.update({f"{name}/{path}": each for path, each in stored.items() if _part(path) not in refused})
+            for path, each in objects.items():
+                place = building / path
+                place.parent.mkdir(parents=True, exist_ok=True)
+                os.link(self._objects / each, place)
+            digest = listing_digest(objects)
             folder = self._trees / digest
             if not self._same(folder, objects):
                 add_bytecode(building)
@@ -130,7 +155,10 @@ class Snapshots:
         finally:
             _remove(building)
         return Snapshot(
-            digest=digest, folder=folder, files={path: stored.rstrip("x") for path, stored in objects.items()}
+            digest=digest,
+            folder=folder,
+            files={path: stored.rstrip("x") for path, stored in objects.items()},
+            left_out=frozenset(left_out),
         )
 
     def _store(self, file: Path) -> str:
@@ -179,23 +207,6 @@ class Snapshots:
             if stored.stat().st_nlink == 1:
                 stored.unlink()
         return gone
-
-
-def _files(root: Path) -> Iterator[tuple[Path, str]]:
-    """Go through the regular files of a folder of skills, each with its path below it; links are followed."""
-
-    def below(folder: Path, path: str, above: tuple[Path, ...]) -> Iterator[tuple[Path, str]]:
-        for each in sorted(folder.iterdir()):
-            if each.name in LEFT_OUT or (not path and each.name in NOT_LOADED):
-                continue
-            if each.is_dir():
-                real = each.resolve()
-                if real not in above:  # a link to a folder around it would never end
-                    yield from below(each, f"{path}{each.name}/", (*above, real))
-            elif each.is_file():
-                yield each, f"{path}{each.name}"
-
-    return below(root, "", (root.resolve(),))
 
 
 def _remove(path: Path) -> None:

@@ -21,7 +21,8 @@ import structlog
 from msgspec import Struct
 from msgspec.structs import replace
 
-from appliance.errors import PoolError, PrerequisiteError, SwiftbotError
+from appliance.errors import IdentityError, NotFoundError, PoolError, PrerequisiteError, SwiftbotError
+from appliance.identity.parts import ALL, InForce, Kind
 from appliance.model import ContainerInfo, ContainerState, Need
 from appliance.pool import images
 from appliance.pool.container import SOCKET, PooledContainer
@@ -38,6 +39,7 @@ from appliance.pool.engine import (
     Found,
 )
 from appliance.pool.settings import PoolConfig
+from appliance.pool.signed import may_be_in
 from appliance.pool.snapshots import Snapshot, Snapshots, unexpected
 from appliance.pool.volumes import State
 from appliance.skills.catalogue import SKILLS, Catalogue, SkillManifest
@@ -86,8 +88,10 @@ class Starter:
         refused: Counter[str],
         on_death: Callable[[PooledContainer], None],
         state: State,
+        parts: InForce = ALL,
     ) -> None:
         self._state = state
+        self._parts = parts
         self._config = config
         self._gateway = gateway
         self._fleet = fleet
@@ -96,6 +100,7 @@ class Starter:
         self._catalogue = catalogue
         self._site = site
         self._proven: set[str] = set()
+        self._unsigned: set[str] = set()
         self._sizes: dict[str, Size] = {}
         self._preloads_mb: dict[str, int] = {}
         self._on_death = on_death
@@ -108,7 +113,13 @@ class Starter:
 
     async def open(self) -> None:
         """Take the snapshot that all containers mount from now on; ConfigError when that cannot be done."""
-        self._taken = await asyncio.to_thread(self._snapshots.take, self._roots)
+        self._taken = await asyncio.to_thread(self._snapshots.take, self._roots, may_be_in(self._parts))
+        names = {root: name for name, root in self._roots.items()}
+        for skill in self._catalogue.skills.values():
+            # Edited since the catalogue was read: its handler is not in the snapshot, so no container is told of it.
+            if skill.implemented and f"{names[skill.folder.parent]}/{skill.folder.name}" in self._taken.left_out:
+                self._refused["unsigned skill"] += 1
+                self._unsigned.add(skill.id)
 
     @property
     def _snapshot(self) -> Snapshot:
@@ -119,7 +130,8 @@ class Starter:
     def skills(self, image: str) -> list[SkillManifest]:
         """Return the skills that a container of an image can run: its own and those of compatible images."""
         served = {image, *self._catalogue.images[image].compatible}
-        return [each for each in self._catalogue.skills.values() if each.implemented and each.image in served]
+        skills = self._catalogue.skills.values()
+        return [each for each in skills if each.implemented and each.image in served and each.id not in self._unsigned]
 
     def size(self, image: str, need: Need | None = None) -> Size:
         """Return what a container of an image gets: enough for each of its skills, and for `need`."""
@@ -232,8 +244,8 @@ class Starter:
     async def _create(self, image: str, spec: ContainerSpec, engine: Engine) -> str:
         """Create the container; an image that is not there is asked of the other gateways first."""
         try:
-            return await engine.create(spec)
-        except PrerequisiteError:
+            return await engine.create(await self._signed(spec, engine))
+        except (PrerequisiteError, NotFoundError):
             try:
                 await self._state.bring_image(spec.image)
             except SwiftbotError as error:
@@ -242,7 +254,20 @@ class Starter:
                     remedy=images.build_command(self._catalogue.images[image]),
                 ) from error
             log.info("image brought", image=spec.image)
-            return await engine.create(spec)
+            return await engine.create(await self._signed(spec, engine))
+
+    async def _signed(self, spec: ContainerSpec, engine: Engine) -> ContainerSpec:
+        """Return a specification that names its image by its id; IdentityError, counted, where that is not signed."""
+        if not self._parts.checked:
+            return spec
+        found = await engine.image(spec.image)
+        try:
+            self._parts.check(Kind.IMAGE, spec.image, found.id)
+        except IdentityError:
+            self._refused["unsigned image"] += 1
+            raise
+        # A tag may be given to another image before the container is made.
+        return replace(spec, image=found.id)
 
     async def _discard(self, container: PooledContainer, engine: Engine) -> None:
         with contextlib.suppress(SwiftbotError):
@@ -297,7 +322,9 @@ class Starter:
             container.mounts = size.volumes
             container.info = replace(container.info, id=name, cpu=size.cpu, memory_mb=size.memory_mb)
             self.look_at_state(container)
-            if found.labels.get(LABEL_STATE) != self._made(image):
+            if self._parts.checked and not self._parts.has(Kind.IMAGE, self.reference(image), found.image):
+                reason = "made of an image that is not signed"
+            elif found.labels.get(LABEL_STATE) != self._made(image):
                 reason = "made of another image, other code or with other settings"
             else:
                 reason = await self._take_over(container)

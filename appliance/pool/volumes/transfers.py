@@ -26,7 +26,15 @@ from typing import Any
 import msgspec
 import structlog
 
-from appliance.errors import CancelledByOperatorError, PayloadError, RefusedError, SwiftbotError, UnreachableError
+from appliance.errors import (
+    CancelledByOperatorError,
+    IdentityError,
+    PayloadError,
+    RefusedError,
+    SwiftbotError,
+    UnreachableError,
+)
+from appliance.identity.parts import ALL, InForce, Kind
 from appliance.model import keyspace
 from appliance.model.transfer_api import (
     Brought,
@@ -166,6 +174,7 @@ class Transfers:
         storage: Podman, a client of its own: an image takes seconds, and must not hold up starts. Closed by its owner.
         data_dir: the gateway's data folder; `transfer` in it is ours.
         on_change: called when `images` has changed.
+        parts: which images may be fetched.
     """
 
     def __init__(
@@ -177,7 +186,9 @@ class Transfers:
         storage: PodmanEngine,
         data_dir: Path,
         on_change: Callable[[], None] = lambda: None,
+        parts: InForce = ALL,
     ) -> None:
+        self._parts = parts
         self.refused: Counter[str] = Counter()
         """Bad input and refusals by kind, for GatewayStatus.refused (`Volumes.refused` has those of the ledger)."""
         self._on_change = on_change
@@ -256,8 +267,11 @@ class Transfers:
 
         Raises:
             NotFoundError: no gateway that answers has it.
+            IdentityError: what is here, or what all of them give, is not in the signed list of parts.
         """
         if await self._storage.has_image(reference):
+            if self._parts.checked:
+                self._check_signed(reference, (await self._storage.image(reference)).id)
             return Brought(what=f"image/{reference}")
         if not may_be_given(reference):
             raise RefusedError(f"{reference[:100]!r} is not given", remedy=f"only {REFERENCE_PREFIX}… are")
@@ -344,9 +358,10 @@ class Transfers:
         arrival = await self._fetcher.fetch(kind, name, sources, job, accept=accept, patient=patient)
         try:
             yield arrival
-        except PayloadError:
+        except (PayloadError, IdentityError) as error:
             # Whole and as announced, and yet not what it should be: no part of it is worth keeping.
-            self.refused[f"transfer bad {kind}"] += 1
+            if isinstance(error, PayloadError):
+                self.refused[f"transfer bad {kind}"] += 1
             await asyncio.to_thread(arrival.remove)
             raise
         else:
@@ -381,8 +396,9 @@ class Transfers:
                 async with self._fetched("image", reference, sources, job, accept=too_large, patient=False) as arrival:
                     source = job.source
                     layout = read_layout(await asyncio.to_thread(arrival.path.read_bytes), reference)
+                    self._check_signed(reference, layout.image_id)
                     await self._load(layout, [source, *(each for each in sources if each != source)], job)
-            except PayloadError:
+            except (PayloadError, IdentityError):
                 # The gateway whose layout it was is left, whichever gave the parts; without one all have been asked.
                 sources = [each for each in sources if each != source]
                 if not source or not sources:
@@ -390,6 +406,14 @@ class Transfers:
             else:
                 await self._look()
                 return self._brought(job)
+
+    def _check_signed(self, reference: str, image_id: str) -> None:
+        """Raise IdentityError, counted, unless an image is in the signed list of parts."""
+        try:
+            self._parts.check(Kind.IMAGE, reference, image_id)
+        except IdentityError:
+            self.refused["unsigned image"] += 1
+            raise
 
     async def _load(self, layout: ImageLayout, sources: list[str], job: Job) -> None:
         """Fetch what is not here and have Podman load it; what Podman then says must be what was announced."""

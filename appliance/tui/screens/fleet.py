@@ -103,6 +103,9 @@ def notes_of(gateway: Gateway) -> list[Note]:
     if each.keys_problem:
         text, remedy = safe(each.keys_problem), "`swiftbot keys list`, then `swiftbot keys renew ROLE NAME`"
         found.append(Note(kind="keys", weight=2, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
+    if each.parts_problem:
+        text, remedy = safe(each.parts_problem), "`swiftbot parts check` there; then sign what is to run"
+        found.append(Note(kind="parts", weight=2, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
     if refused := sum(each.refused.values()):
         kinds = ", ".join(f"{safe(kind, 40)} {count}" for kind, count in sorted(each.refused.items()))
         text = f"{refused} bad inputs refused ({kinds})"

@@ -68,6 +68,7 @@ down = PlannerStatus(slot=SlotStatus(model="m", state="down", problem="its proce
         (of(gateway(limits_enforced=False)), {"no-limits.gw-1": WARNING}),
         (of(gateway(site_problem="site yard has no fence")), {"site.gw-1": WARNING}),
         (of(gateway(keys_problem="its certificate expires in 5 days")), {"keys.gw-1": WARNING}),
+        (of(gateway(parts_problem="not in the list of parts: skill goto")), {"parts.gw-1": WARNING}),
         (of(gateway(disk_free_mb=2048, disk_total_mb=9000)), {}),
         (of(gateway(disk_free_mb=1984, disk_total_mb=9000)), {"disk.gw-1": WARNING}),
         (of(gateway(disk_free_mb=0, disk_total_mb=9000)), {"disk.gw-1": CRITICAL}),

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from appliance.errors import PrerequisiteError, UnreachableError
+from appliance.errors import IdentityError, PrerequisiteError, UnreachableError
 from appliance.llm import local as module
 from appliance.llm.local import ModelProcess
 from appliance.llm.settings import LlmConfig
@@ -77,6 +77,31 @@ async def test_a_folder_that_is_no_models_is_said_at_once(tmp_path: Path) -> Non
     with pytest.raises(PrerequisiteError, match=r"genai_config\.json is missing"):
         await model.start()
     await model.close()
+
+
+async def test_a_folder_that_is_not_signed_is_not_loaded(folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No process is started, whoever asks hears why, and it is looked at again before each try."""
+    looked: list[Path] = []
+
+    def refuse(path: Path) -> None:
+        looked.append(path)
+        raise IdentityError("model m is not signed", remedy="sign it")
+
+    async def start(*_: Any, **__: Any) -> Any:
+        pytest.fail("started")
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    model = ModelProcess(folder, LlmConfig(), refuse)
+    await model.start()
+    try:
+        async with asyncio.timeout(60):
+            with pytest.raises(IdentityError, match="is not signed"):
+                await model.ready()
+            while len(looked) < 3:
+                await asyncio.sleep(0.005)
+        assert set(looked) == {Path(folder)}
+    finally:
+        await model.close()
 
 
 @pytest.mark.parametrize("broken", [OSError(errno.EIO, "Input/output error"), RuntimeError("the handler is closed")])

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from appliance.errors import UnreachableError
+from appliance.identity.parts import ALL, InForce
 from appliance.model import ContainerInfo, ContainerState, Need, Phase, RunEvent, RunRequest, Site
 from appliance.pool import images
 from appliance.pool.pool import Call, Pool
@@ -67,7 +68,9 @@ class Bench:
         self.avoided.append(set(avoid))
         return [each for each in self.offers if each.container.image == need.image]
 
-    async def pool(self, *, gateway: str = "g1", fleet: str = "f1", state: State = ALONE, **settings: Any) -> Pool:
+    async def pool(
+        self, *, gateway: str = "g1", fleet: str = "f1", state: State = ALONE, parts: InForce = ALL, **settings: Any
+    ) -> Pool:
         """Return a started pool."""
         settings = {"floor": {}, "cancel_grace_s": 0.3, "probe_s": 0.2, "mode": "local"} | settings
         pool = Pool(
@@ -84,6 +87,7 @@ class Bench:
             state=state,
             make_engine=lambda: self.engine,
             read_memory=lambda: self.memory,
+            parts=parts,
         )
         self.pools.append(pool)
         await pool.start()

@@ -6,6 +6,7 @@ with real sockets, real forks and real deaths, on a machine that has no Podman.
 
 import asyncio
 import contextlib
+import hashlib
 import json
 import os
 import signal
@@ -14,8 +15,8 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
-from appliance.errors import PoolError, PrerequisiteError, UnreachableError
-from appliance.pool.engine import ContainerSpec, EngineFacts, Exit, Found, FoundImage
+from appliance.errors import NotFoundError, PoolError, PrerequisiteError, UnreachableError
+from appliance.pool.engine import ContainerSpec, EngineFacts, Exit, Found, FoundImage, ImageFacts
 
 
 def environment() -> dict[str, str]:
@@ -53,6 +54,8 @@ class FakeEngine:
         self.missing: set[str] = set()
         """Images by name that are not there."""
         self.references: dict[str, str] = {}
+        self.ids: dict[str, str] = {}
+        """Ids of images by reference, where they are not of it."""
         self.specs: dict[str, ContainerSpec] = {}
         self.processes: dict[str, asyncio.subprocess.Process] = {}
         self.created = 0
@@ -163,6 +166,7 @@ class FakeEngine:
                 name=spec.name,
                 running=name in self.processes and self.processes[name].returncode is None,
                 labels=spec.labels,
+                image=spec.image,
             )
             for name, spec in self.specs.items()
             if labels.items() <= spec.labels.items()
@@ -173,6 +177,12 @@ class FakeEngine:
         self._called("images")
         there = [each for name, each in self.references.items() if name not in self.missing]
         return [FoundImage(id="1", tags=(each,), size_bytes=1, created="") for each in there]
+
+    async def image(self, reference: str) -> ImageFacts:
+        """Return what an image is: its id is that of the reference, or what a test has given it."""
+        if reference not in {each for name, each in self.references.items() if name not in self.missing}:
+            raise NotFoundError(f"there is no image {reference}")
+        return ImageFacts(id=self.ids.get(reference, hashlib.sha256(reference.encode()).hexdigest()), layers=())
 
     async def ensure_volume(self, name: str, labels: Mapping[str, str]) -> None:
         """Do nothing."""

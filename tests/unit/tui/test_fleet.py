@@ -69,6 +69,7 @@ SICK = [
     GatewayStatus(id="g", fleet="f", limits_enforced=False),
     GatewayStatus(id="g", fleet="f", site_problem="site yard has no fence"),
     GatewayStatus(id="g", fleet="f", keys_problem="its certificate expires in 5 days"),
+    GatewayStatus(id="g", fleet="f", parts_problem="not in the list of parts: skill goto"),
 ]
 
 

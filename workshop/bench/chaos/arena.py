@@ -116,6 +116,8 @@ class Arena:
             path = self._config(name)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(configuration.dump(config))
+            if self.secured and name == next(iter(self.sites)):
+                keyring.sign_parts(self.directory / "keys", config)
 
     @property
     def secured(self) -> bool:

@@ -9,8 +9,10 @@ from typing import Any, cast
 
 import msgspec
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.errors import NotFoundError, UnreachableError
+from appliance.errors import IdentityError, NotFoundError, UnreachableError
+from appliance.identity.parts import ALL, InForce, Parts, seal
 from appliance.model.transfer_api import ImageLayout, Manifest, ManifestAsk, ManifestOffer
 from appliance.plane.node import Plane
 from appliance.pool.engine import FoundImage, ImageFacts, PodmanEngine
@@ -137,11 +139,18 @@ class FakeStorage:
         return [FoundImage(id="i", tags=(REFERENCE,), size_bytes=1, created="")] if self.loaded else []
 
 
-def fetching(folder: Path, peers: dict[str, Peer | None]) -> tuple[Transfers, FakePlane, FakeStorage]:
+def fetching(
+    folder: Path, peers: dict[str, Peer | None], named: InForce = ALL
+) -> tuple[Transfers, FakePlane, FakeStorage]:
     """Return the transfers of a gateway that sees these peers."""
     plane, storage = FakePlane(peers), FakeStorage()
     settings = TransferConfig(reserve_mb=0, patience_s=3600.0)
-    parts: dict[str, Any] = {"plane": cast("Plane", plane), "volumes": cast("Volumes", None), "data_dir": folder}
+    parts: dict[str, Any] = {
+        "parts": named,
+        "plane": cast("Plane", plane),
+        "volumes": cast("Volumes", None),
+        "data_dir": folder,
+    }
     for part in ("arriving", "offered"):
         (folder / "transfer" / part).mkdir(parents=True)
     return Transfers(settings, storage=cast("PodmanEngine", storage), **parts), plane, storage
@@ -174,6 +183,45 @@ async def test_the_gateway_of_a_wrong_layout_is_left(tmp_path: Path) -> None:
     await transfers.bring_image(REFERENCE)
     assert storage.loaded is not None
     assert [each for each in plane.asked if each.endswith("image")] == ["g0 image", "g1 image"]
+
+
+def signed(folder: Path, image_id: str) -> InForce:
+    """Return a signed list of parts that names the image with that id."""
+    key = Ed25519PrivateKey.generate()
+    (folder / "parts.json").write_bytes(seal(Parts(fleet="f", number=1, image={REFERENCE: (image_id,)}), key))
+    return InForce(folder / "parts.json", authority=key.public_key(), fleet="f")
+
+
+async def test_an_image_that_is_not_signed_is_left_before_any_of_it_is_loaded(tmp_path: Path) -> None:
+    """A false member's image of the right name is refused, counted, and the next member's is taken."""
+    other = b"a stranger's layer"
+    stranger = Peer(layout=layout(config(other), other), blobs=[config(other), other])
+    good = Peer(layout=layout(config(LAYER), LAYER), blobs=[config(LAYER), LAYER])
+    named = signed(tmp_path, digest(config(LAYER)))
+    transfers, plane, storage = fetching(tmp_path, {"g0": stranger, "g1": good}, named)
+    assert (await transfers.bring_image(REFERENCE)).gateway == "g1"
+    assert storage.loaded is not None
+    assert storage.loaded.id == digest(config(LAYER))
+    assert "g0 blob" not in plane.asked[: plane.asked.index("g1 image")]
+    assert transfers.refused["unsigned image"] == 1
+
+
+async def test_an_image_that_nobody_has_signed_comes_from_nobody(tmp_path: Path) -> None:
+    """Nothing is loaded; the error says what would have to be signed; nothing of it is left in the spool."""
+    good = Peer(layout=layout(config(LAYER), LAYER), blobs=[config(LAYER), LAYER])
+    transfers, _, storage = fetching(tmp_path, {"g0": good}, signed(tmp_path, "0" * 64))
+    with pytest.raises(IdentityError, match="is not signed"):
+        await transfers.bring_image(REFERENCE)
+    assert storage.loaded is None
+    assert not list((tmp_path / "transfer" / "arriving").iterdir())
+
+
+async def test_an_image_of_the_right_tag_and_another_id_is_not_as_good_as_here(tmp_path: Path) -> None:
+    """What lies under the name already is held against the list too."""
+    transfers, _, storage = fetching(tmp_path, {}, signed(tmp_path, "0" * 64))
+    storage.loaded = ImageFacts(id="1" * 64, layers=())
+    with pytest.raises(IdentityError, match="it is 111111111111"):
+        await transfers.bring_image(REFERENCE)
 
 
 async def test_a_layout_is_small(tmp_path: Path) -> None:
