@@ -86,6 +86,8 @@ class Keeper:
         """Questions to people, the latest word of each."""
         self._late: set[str] = set()
         """Alerts of the fleet that could not be written."""
+        self._left_out: set[str] = set()
+        """Alerts that there was no room for, as far as they have been counted."""
         self._changed = asyncio.Event()
         self._synced_at = float("-inf")
         self._ring_changed_at = float("-inf")
@@ -127,7 +129,7 @@ class Keeper:
             self._tasks[record.id] = record
             self._changed.set()
         else:
-            log.warning("alert of a task is left out: too many wait", task=record.id)
+            self._plane.session.refuse("no room for an alert", task=record.id)
 
     def report(self, finding: Finding) -> None:
         """Take something that has happened here and that no other gateway can see; returns at once."""
@@ -135,7 +137,7 @@ class Keeper:
             self._reports[finding.id] = finding
             self._changed.set()
         else:
-            log.warning("an alert is left out: too many wait", alert=finding.id)
+            self._plane.session.refuse("no room for an alert", alert=finding.id)
 
     # --- what is heard ------------------------------------------------------------------------------------------
 
@@ -149,7 +151,11 @@ class Keeper:
         self._enquiries.pop(enquiry.id, None)  # so that it stands last
         self._enquiries[enquiry.id] = enquiry
         while len(self._enquiries) > rules.MOST:
-            del self._enquiries[next(iter(self._enquiries))]
+            # What nobody waits for goes first; a question that is open is never dropped unsaid.
+            over = next((name for name, each in self._enquiries.items() if not each.open), None)
+            if over is None:
+                self._plane.session.refuse("no room for an open question", question=next(iter(self._enquiries)))
+            del self._enquiries[over or next(iter(self._enquiries))]
         self._changed.set()
 
     def _take(self, alert: Alert) -> None:
@@ -159,6 +165,8 @@ class Keeper:
                 self._lost.pop(alert.name, None)
         elif alert.id in self._kept or len(self._kept) < 4 * rules.MOST:
             self._kept[alert.id] = alert
+        else:
+            self._plane.session.refuse("no room for an alert", alert=alert.id)
 
     def _on_event(self, event: FleetEvent) -> None:
         match event:
@@ -225,12 +233,21 @@ class Keeper:
             absent_s=lambda name: now - self._absent.get(name, now),
             gateway=self._plane.gateway,
             now_ns=time.time_ns(),
+            left_out=self._leave_out,
         )
         for change in sorted(wanted, key=lambda each: each.alert.id in self._late):
             if not await self._written(change):
                 self._late.add(change.alert.id)
                 return
             self._late.discard(change.alert.id)
+
+    def _leave_out(self, name: str) -> None:
+        """Say, once for each, that there is no room for an alert."""
+        if name not in self._left_out:
+            if len(self._left_out) > rules.MOST:
+                self._left_out.clear()
+            self._left_out.add(name)
+            self._plane.session.refuse("no room for an alert", alert=name)
 
     async def _look_at_tasks(self) -> None:
         gateway, now_ns = self._plane.gateway, time.time_ns()
@@ -239,7 +256,9 @@ class Keeper:
             finding = rules.of_task(record)
             if finding is None and record.retried_by is not None:
                 await self._recall(rules.alert_id("task-failed", task))
-            for change in rules.task_change(self._kept, task, finding, gateway=gateway, now_ns=now_ns):
+            for change in rules.task_change(
+                self._kept, task, finding, gateway=gateway, now_ns=now_ns, left_out=self._leave_out
+            ):
                 if not await self._written(change):
                     self._tasks[task] = self._tasks.pop(task)  # so that it stands last
                     return

@@ -303,6 +303,7 @@ def changes(
     absent_s: Callable[[str], float],
     gateway: str,
     now_ns: int,
+    left_out: Callable[[str], None] = lambda _: None,
 ) -> list[Change]:
     """Return what is to be written of alerts that every gateway can see.
 
@@ -314,15 +315,16 @@ def changes(
         absent_s: for how long the condition of an alert was not found, seconds.
         gateway: this one.
         now_ns: now, Unix nanoseconds.
+        left_out: called with the id of each alert that there is no room for.
     """
     wanted: list[Change] = []
-    room = Room(kept.values())
+    room = Room(kept.values(), left_out)
     for name, finding in found.items():
         if not mine(name):
             continue
         alert = kept.get(name)
         if alert is None:
-            if room.take(finding.level):
+            if room.take(finding):
                 wanted.append(Change(raised(finding, gateway=gateway, now_ns=now_ns)))
         elif given_up(alert, now_ns=now_ns):
             wanted.append(Change(alert, clear=True))
@@ -356,21 +358,29 @@ def over(alert: Alert, facts: Facts, *, absent_s: float, now_ns: int) -> bool:
 
 
 class Room:
-    """How many more alerts may be added."""
+    """How many more alerts may be added; `left_out` is called with the id of one that there is no room for."""
 
-    def __init__(self, kept: Iterable[Alert]) -> None:
+    def __init__(self, kept: Iterable[Alert], left_out: Callable[[str], None]) -> None:
         self._count = sum(1 for _ in kept)
+        self._left_out = left_out
 
-    def take(self, level: AlertLevel) -> bool:
+    def take(self, finding: Finding) -> bool:
         """Whether there is room for one more, which is taken."""
-        if self._count >= (2 * MOST if level is CRITICAL else MOST):
+        if self._count >= (2 * MOST if finding.level is CRITICAL else MOST):
+            self._left_out(finding.id)
             return False
         self._count += 1
         return True
 
 
 def task_change(
-    kept: Mapping[str, Alert], task: str, finding: Finding | None, *, gateway: str, now_ns: int
+    kept: Mapping[str, Alert],
+    task: str,
+    finding: Finding | None,
+    *,
+    gateway: str,
+    now_ns: int,
+    left_out: Callable[[str], None] = lambda _: None,
 ) -> list[Change]:
     """Return what is to be written of the alerts of one task, whose coordinator this gateway is.
 
@@ -380,6 +390,7 @@ def task_change(
         finding: what the record gives reason for.
         gateway: this one.
         now_ns: now, Unix nanoseconds.
+        left_out: called with the id of an alert that there is no room for.
     """
     ids = [alert_id(kind, task) for kind in TASK_KINDS]
     wanted = [
@@ -394,7 +405,7 @@ def task_change(
     failed = sum(each.kind == "task-failed" for each in kept.values())
     if finding.kind == "task-failed" and failed >= MOST_FAILED:
         return [*wanted, _one_more(kept, gateway=gateway, now_ns=now_ns)]
-    if Room(kept.values()).take(finding.level):
+    if Room(kept.values(), left_out).take(finding):
         wanted.append(Change(raised(finding, gateway=gateway, now_ns=now_ns)))
     return wanted
 

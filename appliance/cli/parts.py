@@ -39,9 +39,9 @@ def _config(file: Path | None) -> "GatewayConfig":
 async def list_(
     *,
     config: ConfigFile = None,
-    images: Annotated[
-        bool, Parameter(negative="--no-images", help="Also the images that are built here; needs Podman.")
-    ] = True,
+    without_images: Annotated[
+        bool, Parameter(help="Leave out the images that are built here; needs no Podman.")
+    ] = False,
     out: Annotated[Path | None, Parameter(help="File to write the list to, for `swiftbot parts sign`.")] = None,
     as_json: Json = False,
 ) -> int:
@@ -51,7 +51,7 @@ async def list_(
     from appliance.deploy.parts import collect
     from appliance.identity import files
 
-    found = await collect(_config(config), with_images=images)
+    found = await collect(_config(config), with_images=not without_images)
     if out is not None:
         files.write(out, msgspec.json.format(msgspec.json.encode(found)), mode=files.PUBLIC)
         console.err.print(f"wrote {out}; next, at the authority: swiftbot parts sign {out}", markup=False)
@@ -145,9 +145,9 @@ async def show_(
 async def check(
     *,
     config: ConfigFile = None,
-    images: Annotated[
-        bool, Parameter(negative="--no-images", help="Also the images that are built here; needs Podman.")
-    ] = True,
+    without_images: Annotated[
+        bool, Parameter(help="Leave out the images that are built here; needs no Podman.")
+    ] = False,
     as_json: Json = False,
 ) -> int:
     """Compare what is on this gateway with its signed list of parts: exit code 9 if anything is not named there."""
@@ -159,7 +159,7 @@ async def check(
     listed = counts.parts
     if counts.checked and not listed.number:
         raise IdentityError(counts.problem, remedy="docs/security.md, Signed parts")
-    found = await collect(read, with_images=images)
+    found = await collect(read, with_images=not without_images)
     missing = unnamed(found, counts)
     rows = [{"kind": str(kind), "name": name, "digest": digest} for kind, name, digest in missing]
     facts = {"checked": counts.checked, "number": listed.number, "unsigned": rows, "problem": counts.problem}

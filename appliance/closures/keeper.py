@@ -124,8 +124,10 @@ class Closures:
             return  # an older word that was under way
         if closure.ended_ns:
             self._kept.pop(closure.id, None)
-        elif known is not None or len(self._kept) < MOST:
+        elif known is not None or len(self._kept) < 2 * MOST:  # of both parts of a partitioned fleet
             self._kept[closure.id] = closure
+        else:
+            self._plane.session.refuse("no room for what is out of use", name=closure.id)
         self._look()
 
     def _look(self) -> None:

@@ -225,6 +225,9 @@ WITH_PATHS = (
     "plane put x --file @", "robots qgc-actions --config @", "robots qgc-actions --config a.toml --out @",
     "gateway --config @", "record --config @", "foxglove --config @", "tui --config @", "tui --replay @",
     "router --listen x --keys @", "images fetch x --skills @",
+    "parts list --without-images --config @", "parts list --without-images --out @", "parts sign @", "parts show @",
+    "parts show --keys @", "parts check --without-images --config @", "parts install @ --config a.toml",
+    "parts install a.toml --config @",
 )  # fmt: skip
 """Command lines with each path that a command takes, the others good, so that this one is reached."""
 

@@ -108,10 +108,14 @@ class Leases:
             return False
         if held is not None and held.lease.id < lease.id:
             return False
-        if held is None and len(self._held) >= MOST:
+        if not self.room(lease.robot):
             return False
         self._held[lease.robot] = _Held(lease, now + lease.lease_s)
         return True
+
+    def room(self, robot: str) -> bool:
+        """Whether a lease of a robot can be remembered."""
+        return robot in self._held or len(self._held) < MOST
 
     def merge(self, leases: Iterable[Lease], now: float) -> bool:
         """Take in what another knows; returns whether anything has changed."""
@@ -194,6 +198,7 @@ class Leasing:
         Raises:
             NotFoundError: no such robot is in the roster.
             ConflictError: somebody has it; the message says who.
+            RefusedError: as many robots are taken over as are remembered.
         """
         if ask.robot not in self._plane.registry.robots:
             known = ", ".join(sorted(self._plane.registry.robots)) or "none"
@@ -210,6 +215,8 @@ class Leasing:
             if held.id == lease.id:
                 return held
             raise self._taken(held)
+        if not self.leases.room(ask.robot):
+            raise RefusedError(f"{MOST} robots are taken over already", remedy="give some of them back")
         try:
             stored = await self._plane.dht.read(_key(ask.robot))
         except UnreachableError as error:
@@ -315,6 +322,8 @@ class Leasing:
         )
 
     def _hear(self, lease: Lease) -> None:
+        if not lease.ended and not self.leases.room(lease.robot):
+            self._plane.session.refuse("no room for a lease", robot=lease.robot, by=lease.by)
         if self.leases.hear(lease, time.monotonic()):
             self._changed()
 

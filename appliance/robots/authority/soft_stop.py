@@ -16,6 +16,7 @@ import itertools
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Iterable
+from typing import NoReturn
 
 import msgspec
 import structlog
@@ -225,8 +226,16 @@ class Stopping:
         await self._tasks.close()
 
     async def merge(self, stops: Iterable[SoftStop], lifted: Iterable[Lifted]) -> None:
-        """Take in what another gateway knows; on disk when it returns."""
-        new = [each for each in stops if self.stops.room(each) and self.stops.add(each)]
+        """Take in what another gateway knows; on disk when it returns. What there is no room for is counted.
+
+        It is not in what this gateway answers then: who asked does not count it among those that have confirmed.
+        """
+        new: list[SoftStop] = []
+        for each in stops:
+            if not self.stops.room(each):
+                self._plane.session.refuse("no room for a soft stop", stop=each.id, by=each.by)
+            elif self.stops.add(each):
+                new.append(each)
         gone = [self.stops.lift(each) for each in lifted]
         if new or any(gone):
             await self._keep()
@@ -235,7 +244,7 @@ class Stopping:
             self._changed()
 
     async def stop(self, ask: StopAsk) -> StopAnswer:
-        """Answer `soft_stop`; RefusedError when as many stops are in force as are kept."""
+        """Answer `soft_stop`; RefusedError when as many stops are in force as are kept: its robots are told once."""
         stop = SoftStop(
             id=ask.act or f"o-{uuid.uuid4().hex[:16]}",
             robots=ask.robots,
@@ -246,8 +255,7 @@ class Stopping:
         if not self.stops.room(stop):
             standing = self.stops.whole_of(stop.by) if not stop.robots else None
             if standing is None:
-                known = len(self.stops.active)
-                raise RefusedError(f"{known} soft stops are in force already", remedy="`swiftbot resume` lifts them")
+                await self._refuse(stop)
             stop = standing  # This operator has stopped the fleet already: its robots get that stop again.
         self.stops.add(stop)
         self._changed()
@@ -271,6 +279,22 @@ class Stopping:
         self._pursue(stop, held)
         return StopAnswer(
             stops=self.stops.active, gateways=confirmed[0], silent=confirmed[1], robots=held, problems=problems
+        )
+
+    async def _refuse(self, stop: SoftStop) -> NoReturn:
+        """Refuse a stop that there is no room for, after its robots were told to hold: they must not go on for that."""
+        roster = self._plane.registry.robots
+        names = [each for each in stop.robots or roster if each in roster and roster[each].online]
+        held, _ = await tell_to_hold(self._plane.session, names, act=stop.id)
+        self._plane.session.refuse("no room for a soft stop", stop=stop.id, by=stop.by)
+        raise RefusedError(
+            f"{len(self.stops.active)} soft stops are in force already, and this one is not kept: "
+            + (
+                f"{', '.join(held[:10])} held once, and may be moved again"
+                if held
+                else "no robot has said that it holds"
+            ),
+            remedy="`swiftbot stop` without a robot stops the fleet and is kept; `swiftbot resume` lifts stops",
         )
 
     async def resume(self, ask: ResumeRobotsAsk, learn: Callable[[], Awaitable[None]]) -> StopAnswer:
@@ -305,7 +329,7 @@ class Stopping:
     def _on_stop(self, key: str, stop: SoftStop | None) -> None:
         if stop is None or stop.id in {each.id for each in self.stops.stops}:
             return
-        if not key.endswith(f"/{stop.id}") or not self.stops.room(stop):
+        if not key.endswith(f"/{stop.id}"):
             self._plane.session.refuse("misplaced operator/stop/*", key=key, says=stop.id)
             return
         self._tasks.start(self.merge((stop,), ()), "soft stop")
@@ -380,11 +404,13 @@ class Stopping:
 
         async def tell(member: str) -> bool:
             try:
-                await self._plane.rpc.call(member, keyspace.STANDING, ask, timeout_s=CONFIRM_S)
+                found = await self._plane.rpc.call(member, keyspace.STANDING, ask, timeout_s=CONFIRM_S)
             except SwiftbotError as error:
                 log.warning("a gateway does not confirm a soft stop", member=member, reason=str(error))
                 return False
-            return True
+            if missing := {each.id for each in stops} - {each.id for each in found.stops}:
+                log.warning("a gateway has no room for a soft stop", member=member, stops=sorted(missing))
+            return not missing
 
         said = dict(zip(others, await asyncio.gather(*(tell(each) for each in others)), strict=True))
         confirmed = tuple(sorted([self._plane.gateway, *(each for each, done in said.items() if done)]))

@@ -301,6 +301,20 @@ def test_a_fleet_has_a_bounded_number_of_alerts(count: int) -> None:
     assert len(fleet.kept) <= 2 * rules.MOST
 
 
+def test_an_alert_that_there_is_no_room_for_is_told() -> None:
+    """Its id is handed on, to be counted: nothing is left out silently."""
+    one = rules.findings(Facts(robots={"r": robot("r", warnings=("low",))}))["robot-warning.r"]
+    kept = {f"x{number}": rules.raised(one, gateway="gw-1", now_ns=1) for number in range(rules.MOST)}
+    left_out: list[str] = []
+    for name in ("late", "later"):
+        facts = Facts(robots={name: robot(name, warnings=("low",))})
+        rules.changes(
+            kept, rules.findings(facts), facts, mine=lambda _: True, absent_s=lambda _: 0.0, gateway="gw-1",
+            now_ns=2, left_out=left_out.append,
+        )  # fmt: skip
+    assert left_out == ["robot-warning.late", "robot-warning.later"]
+
+
 # --- tasks -----------------------------------------------------------------------------------------------------
 
 

@@ -44,7 +44,7 @@ class Typed:
     def list(self, name: str = "list.json") -> Path:
         """List what is here in a file."""
         out = self.folder / name
-        assert self("list", "--no-images", "--config", str(self.config), "--out", str(out))[0] == Exit.DONE
+        assert self("list", "--without-images", "--config", str(self.config), "--out", str(out))[0] == Exit.DONE
         return out
 
     def sign(self, *lists: Path) -> Path:
@@ -57,7 +57,7 @@ class Typed:
 
     def check(self) -> tuple[int, str]:
         """Compare what is here with what is signed."""
-        return self("check", "--no-images", "--config", str(self.config))
+        return self("check", "--without-images", "--config", str(self.config))
 
 
 @pytest.fixture
@@ -90,11 +90,11 @@ def test_the_way_through(typed: Typed) -> None:
 def test_json_has_it_all(typed: Typed, capsys: pytest.CaptureFixture[str]) -> None:
     """What is printed for scripts can be read back."""
     del capsys
-    code, text = typed("list", "--no-images", "--config", str(typed.config), "--json")
+    code, text = typed("list", "--without-images", "--config", str(typed.config), "--json")
     found: Any = msgspec.json.decode(text)
     assert code == Exit.DONE
     assert len(found["skill"]["goto"][0]) == 64
-    code, text = typed("check", "--no-images", "--json")
+    code, text = typed("check", "--without-images", "--json")
     assert msgspec.json.decode(text)["checked"] is False  # no keys: development mode
 
 

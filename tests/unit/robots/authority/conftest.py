@@ -31,14 +31,22 @@ class FakePlane:
         self.puts: list[str] = []
         self.records: dict[str, Record] = {}
         self.mine = True
+        self.others: set[str] = set()
+        self.rpc: Any = None
+        self.refused: list[str] = []
+        """What was refused and counted."""
 
     def robot(self, name: str, *, online: bool = True, gateway: str = "gw-1") -> None:
         """Have the roster say so of a robot."""
         self.registry.robots[name] = RobotInfo(id=name, kind="mavlink", gateway=gateway, online=online)
 
+    def refuse(self, what: str, **_: Any) -> None:
+        """Count it."""
+        self.refused.append(what)
+
     def members(self) -> frozenset[str]:
         """Return this gateway alone."""
-        return frozenset({self.gateway})
+        return frozenset({self.gateway, *self.others})
 
     def owns(self, key: str) -> bool:
         """Whether a robot of no gateway is ours."""

@@ -92,5 +92,7 @@ def test_what_is_remembered_is_bounded() -> None:
     for number in range(MOST + 20):
         it.hear(lease(f"l{number}", f"r{number}"), 0.0)
     assert len(it.all) == MOST
+    assert not it.room("another")
+    assert it.room("r1")
     it.expire(100.0)
     assert it.all == ()

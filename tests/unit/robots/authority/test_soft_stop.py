@@ -7,8 +7,9 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.errors import RefusedError
 from appliance.model import SoftStop, encode
-from appliance.model.robot_api import ResumeRobotsAsk, StandingAsk, StopAsk
+from appliance.model.robot_api import ResumeRobotsAsk, Standing, StandingAsk, StopAsk
 from appliance.robots.authority import soft_stop
 from appliance.robots.authority.soft_stop import MOST, RESERVE, STORED, Stopping
 from tests.unit.robots.authority.conftest import FakePlane
@@ -166,6 +167,36 @@ async def test_a_stop_of_the_fleet_stays_when_others_lift_theirs(plane: FakePlan
     assert "mine" in {each.id for each in answer.stops}
     await known.resume(ResumeRobotsAsk(by="ann", act="r", stops=tuple(each.id for each in theirs)), nothing)
     assert [each.id for each in known.stops.active] == ["mine"]
+
+
+async def test_a_stop_that_there_is_no_room_for_is_never_taken_for_kept(plane: FakePlane, known: Stopping) -> None:
+    """Of one robot, when as many are in force: it is told to hold, and who asked hears that the stop is not kept."""
+    await known.start()
+    known.stops.merge([SoftStop(id=f"s{number}", robots=(f"x{number}",)) for number in range(MOST - RESERVE)], ())
+    plane.robot("r1")
+    with pytest.raises(RefusedError, match="is not kept: r1 held once"):
+        await known.stop(StopAsk(by="ann", robots=("r1",)))
+    assert "r1" in plane.told
+    await known.merge((SoftStop(id="elsewhere", by="bob", robots=("r2",)),), ())
+    assert plane.refused == ["no room for a soft stop"] * 2
+    assert not known.stops.in_force("elsewhere")
+
+
+async def test_a_gateway_without_room_has_not_confirmed(plane: FakePlane, known: Stopping) -> None:
+    """It answers with what it keeps; what is not in there is not kept, whatever it says besides."""
+    await known.start()
+    full: set[str] = set()
+
+    async def call(member: str, _: object, ask: StandingAsk, *, timeout_s: float) -> Standing:
+        assert timeout_s > 0
+        return Standing(stops=() if member in full else ask.stops)
+
+    plane.rpc = SimpleNamespace(call=call)
+    plane.others = {"gw-2", "gw-3"}
+    assert (await known.stop(StopAsk(by="ann", robots=("r1",)))).gateways == ("gw-1", "gw-2", "gw-3")
+    full.add("gw-3")
+    answer = await known.stop(StopAsk(by="ann"))
+    assert (answer.gateways, answer.silent) == (("gw-1", "gw-2"), ("gw-3",))
 
 
 async def test_only_what_the_operator_has_seen_is_lifted(known: Stopping) -> None:
