@@ -232,6 +232,7 @@ REPLAY: tuple[Operation, ...] = (
 
 
 SCREENS: dict[str, tuple[str, str]] = {
+    "overview": ("Overview", "Alerts, robots on a map, tasks in work, load of gateways; Enter opens a row"),
     "fleet": ("Fleet", "Gateways: load, memory, pool, tasks, links; Enter shows one whole"),
     "tasks": ("Tasks", "Tasks; Enter opens one with the graph of its plan"),
     "robots": ("Robots", "Robots: mode, battery, position, mission; a map; Enter shows one whole"),
@@ -244,13 +245,13 @@ SCREENS: dict[str, tuple[str, str]] = {
     "log": ("Log", "Notices, runs and log lines as they come, or any keys"),
     "replay": ("Replay", "A recorded log on all screens: play, pause, seek, rate"),
 }
-"""Screens in the order of their number keys: title and what they show."""
+"""Screens in the order of their number keys, from 0: title and what they show."""
 
 
 def _screens() -> tuple[Operation, ...]:
     return tuple(
         Operation(name=name, title=title, help=shows, keys=(str(number),), call=f"screen {name}", footer=False)
-        for number, (name, (title, shows)) in enumerate(SCREENS.items(), start=1)
+        for number, (name, (title, shows)) in enumerate(SCREENS.items())
     )
 
 

@@ -23,6 +23,7 @@ from textual.command import DiscoveryHit, Hit, Hits, Provider
 from textual.css.query import NoMatches
 from textual.driver import Driver
 from textual.notifications import SeverityLevel
+from textual.screen import Screen
 from textual.widgets import Input
 
 from appliance.alerts.rules import ordered
@@ -30,6 +31,7 @@ from appliance.errors import ConfigError, PayloadError, SwiftbotError, Unreachab
 from appliance.llm.stop_words import stop_request
 from appliance.llm.training_words import training_request
 from appliance.model import Approval, TaskRecord
+from appliance.model.alerts import Alert, Subject
 from appliance.model.messages import enums_open
 from appliance.model.roles import lacks
 from appliance.operations import STOP_IN_WORDS, Operation
@@ -43,16 +45,17 @@ from appliance.tui.command_line import Command
 from appliance.tui.replay import ReplayView, faster, rate_of, slower
 from appliance.tui.safe import clip, safe
 from appliance.tui.screens.alerts import AlertsScreen
-from appliance.tui.screens.fleet import FleetOverview, PoolScreen
+from appliance.tui.screens.fleet import FleetOverview, GatewayScreen, PoolScreen
 from appliance.tui.screens.learning import LearningScreen
 from appliance.tui.screens.logs import LogScreen
 from appliance.tui.screens.models import LlmScreen
+from appliance.tui.screens.overview import OverviewScreen
 from appliance.tui.screens.replay import ReplayScreen
 from appliance.tui.screens.review import ReviewScreen
-from appliance.tui.screens.robots import RobotsScreen
+from appliance.tui.screens.robots import RobotScreen, RobotsScreen
 from appliance.tui.screens.submit import History, SubmitDialog, default_file
 from appliance.tui.screens.takeover import TakeoverScreen
-from appliance.tui.screens.tasks import TasksScreen
+from appliance.tui.screens.tasks import TaskScreen, TasksScreen
 from appliance.tui.settings import TuiConfig
 from appliance.tui.subscriptions import FleetView, View, take_own_log
 from appliance.tui.task_view import state_cell
@@ -60,6 +63,7 @@ from appliance.tui.widgets import Lines
 from appliance.tui.widgets.dialogs import ConfirmDialog, HelpDialog, TextDialog
 
 SCREENS: dict[str, type[FleetScreen]] = {
+    "overview": OverviewScreen,
     "fleet": FleetOverview,
     "tasks": TasksScreen,
     "robots": RobotsScreen,
@@ -82,6 +86,19 @@ REPLAY_STEP_S = 10.0
 """How far a key goes in a recorded log."""
 _UNSAID = ("stops", "alerts", "robots", "unknown", "roster")
 """Arguments that no person writes."""
+
+
+def screen_of(alert: Alert) -> Screen[None] | None:
+    """Return the screen of what an alert is about; None where there is none of its own."""
+    match alert.subject:
+        case Subject.GATEWAY:
+            return GatewayScreen(alert.name)
+        case Subject.ROBOT:
+            return RobotScreen(alert.name)
+        case Subject.TASK:
+            return ReviewScreen(alert.name) if alert.kind == "plan-waits" else TaskScreen(alert.name)
+        case _:
+            return None
 
 
 class OperationProvider(Provider):
@@ -122,7 +139,7 @@ class SwiftbotApp(App[None], inherit_bindings=False):
     TITLE = "SwiftBot"
     BINDINGS = bindings()  # pyright: ignore[reportAssignmentType] - Textual wants a list of its own union
     MODES = SCREENS  # pyright: ignore[reportAssignmentType] - of classes, which make themselves
-    DEFAULT_MODE = "fleet"
+    DEFAULT_MODE = "overview"
     ENABLE_COMMAND_PALETTE: ClassVar[bool] = False
     """Textual would bind ^p to it for good; it is there all the same, under the keys of the action `palette`."""
     COMMANDS = {OperationProvider}  # pyright: ignore[reportAssignmentType] - of one class
@@ -456,6 +473,18 @@ class SwiftbotApp(App[None], inherit_bindings=False):
         """Show the alerts, over whatever is seen."""
         if not isinstance(self.screen, AlertsScreen):
             self.push_screen(AlertsScreen())
+
+    def show_alert(self, name: str) -> None:
+        """Open what an alert is about; a question is answered in the prompt."""
+        alert = self.view.store.alerts.get(name)
+        if alert is None:
+            return
+        if alert.subject is Subject.QUESTION:
+            self.run_line(f"answer {alert.name}")
+        elif (found := screen_of(alert)) is not None:
+            self.push_screen(found)
+        else:
+            self.run_line("fleet")
 
     def do_here(self, name: str, given: Mapping[str, str]) -> None:
         """Do what the screen that is seen has under this name."""

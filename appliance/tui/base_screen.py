@@ -53,6 +53,10 @@ class Host(Protocol):
         """Return command lines that go on from this one."""
         ...
 
+    def show_alert(self, name: str) -> None:
+        """Open what an alert is about."""
+        ...
+
     def tell(self, error: SwiftbotError) -> None:
         """Show an error with its remedy."""
         ...
@@ -255,11 +259,11 @@ class FleetScreen(Screen[None], inherit_bindings=False):
 
     def _tabs(self, width: int) -> Text:
         lit = self.tab or self.scope
-        whole = sum(len(title) + 4 for title, _ in actions.SCREENS.values()) + len(self.title_of()) + 2 <= width
+        whole = sum(len(title) + 3 for title, _ in actions.SCREENS.values()) + len(self.title_of()) + 3 <= width
         line = Text(no_wrap=True)
-        for number, (name, (title, _)) in enumerate(actions.SCREENS.items(), start=1):
+        for number, (name, (title, _)) in enumerate(actions.SCREENS.items()):
             here = name == lit
-            words = f" {number} {title} " if whole or here else f" {number} "
+            words = f" {number} {title} " if here else f" {number} {title}" if whole else f" {number} "
             click = Style(meta={"@click": f"app.act('{name}')"})
             line.append(words, (Style(reverse=True, bold=True) if here else Style()) + click)
             if here and self.title_of():

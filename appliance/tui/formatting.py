@@ -63,17 +63,26 @@ def bar(fraction: float, width: int = _BAR_WIDTH) -> str:
     return f"{'█' * full}{'░' * (width - full)} {share:.0%}"
 
 
-def sparkline(values: Sequence[float], width: int) -> str:
-    """Return the last values as a line of `width` bars at most; on a logarithmic scale when they span decades."""
+def sparkline(values: Sequence[float], width: int, *, span: tuple[float, float] | None = None) -> str:
+    """Return the last values as a line of `width` bars at most.
+
+    Args:
+        values: not negative.
+        width: cells.
+        span: the values of the lowest and the highest bar; None: the least and the greatest value, on a logarithmic
+            scale when they span decades.
+    """
     if width <= 0 or not values:
         return ""
     shown = [max(0.0, each) if math.isfinite(each) else 0.0 for each in values[-width:]]
-    least, most = min(shown), max(shown)
-    if most > 20 * max(least, 1e-9):
+    least, most = span or (min(shown), max(shown))
+    if span is not None:
+        shown = [min(most, max(least, each)) for each in shown]
+    elif most > 20 * max(least, 1e-9):
         shown = [math.log1p(each) for each in shown]
         least, most = min(shown), max(shown)
-    span = (most - least) or 1.0
-    return "".join(_BARS[min(len(_BARS) - 1, int((each - least) / span * len(_BARS)))] for each in shown)
+    reach = (most - least) or 1.0
+    return "".join(_BARS[min(len(_BARS) - 1, int((each - least) / reach * len(_BARS)))] for each in shown)
 
 
 def hanging(text: str, margin: str, width: int) -> str:

@@ -166,6 +166,8 @@ RUNS = 200
 CLIENTS = 10_000
 LOST_KEPT_S = 3600.0
 """For how long a gateway that went away is still shown, with since when."""
+LOADS = 60
+"""Latest reports of a gateway whose load is remembered."""
 STARTS = 400
 """Latest starts of runs whose phase and time are remembered."""
 KINDS = (
@@ -242,6 +244,8 @@ class Store:
 
     def __init__(self, *, tasks: int = 2000, entries: int = 2000) -> None:
         self.gateways: Shelf[Gateway] = Shelf(GATEWAYS)
+        self.loads: dict[str, deque[float]] = {}
+        """The load of each gateway in its last reports, 0 to 1, the newest last."""
         self.containers: Shelf[ContainerInfo] = Shelf(CONTAINERS)
         """By `gateway/container`."""
         self.robots: Shelf[RobotInfo] = Shelf(ROBOTS)
@@ -316,6 +320,7 @@ class Store:
         self.stops = Stops()
         self._stops_heard += 1
         self._heard.clear()
+        self.loads.clear()
         self.entries.clear()
         self.starts.clear()
         self._serial += 1
@@ -343,6 +348,8 @@ class Store:
         """
         for name, status in present.items():
             known = self.gateways.get(name)
+            if known is None or known.status is not status:
+                self.loads.setdefault(name, deque(maxlen=LOADS)).append(status.load)
             if known is None:
                 self.gateways.put(name, Gateway(status=status))
             elif known.status is not status or known.lost_ns:
@@ -354,6 +361,7 @@ class Store:
                 self.gateways.put(name, structs.replace(known, lost_ns=now_ns, latency_ms=None, arc=None))
             elif now_ns - known.lost_ns > LOST_KEPT_S * 1e9:
                 self.gateways.drop(name)
+                self.loads.pop(name, None)
 
     def measured(self, gateway: str, *, latency_ms: float | None = None, arc: float | None = None) -> None:
         """Note what was measured of a gateway from here; None leaves what is known."""

@@ -5,7 +5,6 @@ import time
 from rich.text import Text
 from textual import on
 from textual.app import ComposeResult
-from textual.screen import Screen
 from textual.widgets import Static
 
 from appliance.alerts.rules import ordered
@@ -15,10 +14,6 @@ from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen
 from appliance.tui.formatting import Cell, age, duration
 from appliance.tui.safe import safe
-from appliance.tui.screens.fleet import GatewayScreen
-from appliance.tui.screens.review import ReviewScreen
-from appliance.tui.screens.robots import RobotScreen
-from appliance.tui.screens.tasks import TaskScreen
 from appliance.tui.store import Store
 from appliance.tui.widgets.grid import Column, Grid
 
@@ -66,17 +61,10 @@ def about(alert: Alert) -> Text:
     return out
 
 
-def screen_of(alert: Alert) -> Screen[None] | None:
-    """Return the screen of what an alert is about; None where there is none of its own."""
-    match alert.subject:
-        case Subject.GATEWAY:
-            return GatewayScreen(alert.name)
-        case Subject.ROBOT:
-            return RobotScreen(alert.name)
-        case Subject.TASK:
-            return ReviewScreen(alert.name) if alert.kind == "plan-waits" else TaskScreen(alert.name)
-        case _:
-            return None
+def chosen_of(alert: Alert) -> dict[str, str]:
+    """Return an alert, and what it is about."""
+    kind = "enquiry" if alert.subject is Subject.QUESTION else str(alert.subject)
+    return {"alert": alert.id, kind: alert.name}
 
 
 class AlertsScreen(FleetScreen):
@@ -120,20 +108,9 @@ class AlertsScreen(FleetScreen):
     def drill(self, event: Grid.Picked) -> None:
         """Show what it is about."""
         event.stop()
-        alert = self.store.alerts.get(event.key)
-        if alert is not None and alert.subject is Subject.QUESTION:
-            self.host.run_line(f"answer {alert.name}")
-            return
-        screen = screen_of(alert) if alert is not None else None
-        if screen is not None:
-            self.application.push_screen(screen)
-        elif alert is not None:
-            self.host.run_line("fleet")
+        self.host.show_alert(event.key)
 
     def chosen(self) -> dict[str, str]:
         """Return the selected alert, and what it is about."""
         alert: Alert | None = self.query_one("#alerts", Grid).thing
-        if alert is None:
-            return {}
-        kind = "enquiry" if alert.subject is Subject.QUESTION else str(alert.subject)
-        return {"alert": alert.id, kind: alert.name}
+        return {} if alert is None else chosen_of(alert)

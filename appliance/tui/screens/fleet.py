@@ -225,7 +225,7 @@ def starts_text(starts: Sequence[Start], width: int) -> Text:
     room = max(8, min(40, width - 50))
     by_phase = ", ".join(f"{phase or 'not told'} {count}" for phase, count in phases.most_common())
     return Text.assemble(
-        ("warm  ", "bold"), (f"{warm / len(starts):4.0%} ", ""), (sparkline([*hits, 0.0, 1.0], room + 2)[:-2], "green"),
+        ("warm  ", "bold"), (f"{warm / len(starts):4.0%} ", ""), (sparkline(hits, room, span=(0.0, 1.0)), "green"),
         f"  of the last {len(starts)} starts: {by_phase}\n",
         ("start ", "bold"), f"{milliseconds(sorted(times)[len(times) // 2])} ", (sparkline(times, room), "cyan"),
         f"  median; longest {milliseconds(max(times))}",
@@ -455,7 +455,7 @@ def gateway_cells(gateway: Gateway, now_ns: int = 0) -> tuple[Cell, ...]:
     return (
         (safe(each.id, 63), f"bold {dim}"),
         gateway_state(gateway),
-        (f"{each.load:.0%}", dim or _hot(each.load)),
+        (f"{each.load:.0%}", dim or hot(each.load)),
         (f"{each.cpu_percent:.0f}%", dim),
         (f"{each.memory_mb:.0f}M", dim),
         (f"{each.ready}/{each.containers}", dim),
@@ -465,13 +465,24 @@ def gateway_cells(gateway: Gateway, now_ns: int = 0) -> tuple[Cell, ...]:
         ("" if gateway.arc is None else f"{gateway.arc:.0%}", dim),
         (safe(each.version, 12), dim),
         (age(each.started_ns, now_ns), dim),
-        (bar(each.load, 10), dim or _hot(each.load)),
+        (bar(each.load, 10), dim or hot(each.load)),
         (safe(", ".join(each.robots), 80), dim),
     )
 
 
-def _hot(load: float) -> str:
+def hot(load: float) -> str:
+    """Return the style of a load, 0 to 1: empty while there is room."""
     return "red" if load >= 0.9 else "yellow" if load >= 0.7 else ""
+
+
+def gateways_of(store: Store, fleet: str) -> dict[str, Gateway]:
+    """Return the gateways by name, also those that only an alert tells of."""
+    known = dict(store.gateways.items())
+    for each in store.alerts.values():
+        # Lost before this terminal UI was opened: its name is all that is known of it.
+        if each.kind == "gateway-lost" and each.name not in known:
+            known[each.name] = Gateway(status=GatewayStatus(id=each.name, fleet=fleet), lost_ns=each.since_ns)
+    return {name: known[name] for name in sorted(known)}
 
 
 class FleetOverview(FleetScreen):
@@ -488,14 +499,7 @@ class FleetOverview(FleetScreen):
 
     def draw_body(self, store: Store) -> None:
         """Show the gateways by name."""
-        known = dict(store.gateways.items())
-        for each in store.alerts.values():
-            # Lost before this terminal UI was opened: its name is all that is known of it.
-            if each.kind == "gateway-lost" and each.name not in known:
-                known[each.name] = Gateway(
-                    status=GatewayStatus(id=each.name, fleet=self.view.fleet), lost_ns=each.since_ns
-                )
-        rows = {name: known[name] for name in sorted(known)}
+        rows = gateways_of(store, self.view.fleet)
         shown = self.filtered(rows, _text)
         empty = "no gateway matches the filter" if rows else "no gateway is known yet"
         self.query_one("#gateways", Grid).show(shown, empty=empty)

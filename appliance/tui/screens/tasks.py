@@ -216,6 +216,15 @@ def searched(name: str, record: TaskRecord) -> str:
     return " ".join(parts)
 
 
+def chosen_of(record: TaskRecord) -> dict[str, str]:
+    """Return a task, and a subtask of it when only one runs."""
+    running = [each.subtask.id for each in record.subtasks if each.state is SubtaskState.RUNNING]
+    found = {"task": record.id}
+    if len(running) == 1:
+        found["subtask"] = f"{record.id}/{running[0]}"
+    return found
+
+
 class TasksScreen(FleetScreen):
     """Tasks, newest first, over the plan of the selected one. Enter opens it."""
 
@@ -284,10 +293,4 @@ class TasksScreen(FleetScreen):
     def chosen(self) -> dict[str, str]:
         """Return the selected task, and a subtask of it when only one runs."""
         record: TaskRecord | None = self.query_one("#tasks", Grid).thing
-        if record is None:
-            return {}
-        running = [each.subtask.id for each in record.subtasks if each.state is SubtaskState.RUNNING]
-        found = {"task": record.id}
-        if len(running) == 1:
-            found["subtask"] = f"{record.id}/{running[0]}"
-        return found
+        return {} if record is None else chosen_of(record)

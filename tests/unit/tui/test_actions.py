@@ -58,7 +58,7 @@ def test_each_action_is_whole() -> None:
 def test_keys_do_not_clash() -> None:
     """On every screen a key is one action, and all screens have their number."""
     keymap({})
-    for number, name in enumerate(SCREENS, start=1):
+    for number, name in enumerate(SCREENS):
         assert BY_NAME[name].keys == (str(number),)
 
 
@@ -315,7 +315,7 @@ async def test_what_is_missing_is_asked_for(view: "FakeView") -> None:
     """An action that needs more than is selected opens the line with what is known and says what is missing."""
     app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE) as pilot:
-        await pilot.press("colon", *"fetch", "enter")
+        await pilot.press("1", "colon", *"fetch", "enter")
         text = await settle(app, pilot)
         assert "reference? :fetch REFERENCE GATEWAY" in text
         assert app.front is not None
@@ -390,6 +390,7 @@ async def test_same_order_twice_is_one(view: "FakeView") -> None:
     view.orders.drain = drain
     app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=(100, 24)) as pilot:
+        await pilot.press("1")
         await pilot.pause()
         for _ in range(2):
             await pilot.press("d", "y")
@@ -407,7 +408,7 @@ async def test_defect_of_an_order_does_not_end_the_ui(view: "FakeView") -> None:
     app = SwiftbotApp(view, UNLOCKED)
     async with app.run_test(size=SIZE, notifications=True) as pilot:
         await settle(app, pilot)
-        await pilot.press("u")
+        await pilot.press("1", "u")
         text = await settle(app, pilot)
         assert "internal error" in text
         assert app.is_running
@@ -434,7 +435,7 @@ async def test_gateway_is_drilled_into_and_left(view: "FakeView") -> None:
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
         await settle(app, pilot)
-        await pilot.press("enter")
+        await pilot.press("1", "enter")
         text = await settle(app, pilot)
         for expected in ("› gw-a", "local:tiny, rules", "base:1", "busy", "drone-1"):
             assert expected in text

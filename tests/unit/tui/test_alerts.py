@@ -58,7 +58,7 @@ async def test_the_header_of_every_screen_counts_alerts(view: "FakeView", size: 
     view.store.take_alerts(ALL)
     app = SwiftbotApp(view)
     async with app.run_test(size=size) as pilot:
-        for number in range(1, len(SCREENS) + 1):
+        for number in range(len(SCREENS)):
             await pilot.press(str(number))
             assert "! ✘3  ▲2 " in (await settle(app, pilot)).splitlines()[0]
         acked = replace(ROBOT, acked=Word(by="ann"))
@@ -121,6 +121,7 @@ async def test_lines_that_were_acknowledged_leave_the_fleet_screen(view: "FakeVi
     """A condition of the machine that somebody has taken note of is no yellow line for ever."""
     app = SwiftbotApp(view, TuiConfig())
     async with app.run_test(size=(160, 48)) as pilot:
+        await pilot.press("1")
         assert "container limits are not enforced" in await settle(app, pilot)
         for name in view.store.gateways:
             known = alert("no-limits", Subject.GATEWAY, name, level=AlertLevel.WARNING)
@@ -133,6 +134,7 @@ async def test_a_gateway_that_was_lost_before_is_on_the_fleet_screen(view: "Fake
     view.store.take_alerts((alert("gateway-lost", Subject.GATEWAY, "gw-gone"),))
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("1")
         line = next(each for each in (await settle(app, pilot)).splitlines() if "gw-gone" in each)
         assert "✘ lost" in line
 

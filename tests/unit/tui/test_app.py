@@ -35,6 +35,7 @@ async def test_fleet_is_shown_at_80_by_24(view: "FakeView") -> None:
     """The first screen has gateways with load and pool, and what is wrong, in whole sentences."""
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("1")
         text = await settle(app, pilot)
         for expected in ("gw-a", "42%", "3/4", "test · 2 gw · 2 robots · 1 active", "[R] read-only"):
             assert expected in text
@@ -77,6 +78,7 @@ async def test_recorder_is_shown(view: "FakeView", status: RecorderStatus, expec
     view.store.recorders.put(status.id, status)
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("1")
         assert expected in await settle(app, pilot)
 
 

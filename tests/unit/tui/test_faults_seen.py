@@ -84,7 +84,7 @@ async def test_keys_of_replay_work_on_every_screen() -> None:
     replay = await ReplayView.open(LOG)
     app = SwiftbotApp(replay)
     async with app.run_test(size=SIZE) as pilot:
-        for number in range(1, len(SCREENS) + 1):
+        for number in range(len(SCREENS)):
             await pilot.press(str(number), "J", "0", "enter")
             await pilot.pause()
             assert replay.head.position_s(0) == 0.0
@@ -123,7 +123,7 @@ async def test_parts_of_screens_have_the_keys_of_the_table(view: "FakeView") -> 
     """Whatever has the focus on a screen takes no key that `part_keys` does not know of."""
     app = SwiftbotApp(view)
     async with app.run_test(size=SIZE) as pilot:
-        for number, name in enumerate(SCREENS, start=1):
+        for number, name in enumerate(SCREENS):
             await pilot.press(str(number))
             await settle(app, pilot)
             for widget in app.screen.query("#body *").results(Widget):
@@ -139,7 +139,7 @@ async def test_help_says_that_the_stop_needs_no_unlock(view: "FakeView") -> None
     """Before F8 there is no sign that it needs the UI unlocked; before what does, there is."""
     app = SwiftbotApp(view)
     async with app.run_test(size=(100, 60)) as pilot:
-        await pilot.press("question_mark")
+        await pilot.press("1", "question_mark")
         lines = (await settle(app, pilot)).splitlines()
     stop = next(line for line in lines if "F8" in line)
     assert " w " not in stop[:20]

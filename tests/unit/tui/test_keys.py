@@ -32,7 +32,7 @@ async def test_every_control_key_has_a_name(view: "FakeView") -> None:
     """On every screen, in the line and where an instruction is written, each can be given another key."""
     app = SwiftbotApp(view, TuiConfig(write=True))
     async with app.run_test(size=SIZE) as pilot:
-        for number in range(1, len(SCREENS) + 1):
+        for number in range(len(SCREENS)):
             await pilot.press(str(number))
             await pilot.pause()
             assert nameless(app) == []

@@ -173,7 +173,7 @@ async def test_an_instruction_to_train_shows_what_would_start_and_starts_it_when
     app = SwiftbotApp(learning, TuiConfig(write=True))
     async with app.run_test(size=SIZES[0]) as pilot:
         for answer in ("n", "y"):
-            await pilot.press("s", *"train clips on all robots for 20 rounds", "enter")
+            await pilot.press("1", "s", *"train clips on all robots for 20 rounds", "enter")
             await pilot.pause()
             await pilot.pause()
             assert isinstance(app.screen, ConfirmDialog)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.anyio, pytest.mark.thorough]
 SCREENS = {
+    "overview": ("0",),
     "fleet": ("1",),
     "gateway": ("1", "enter"),
     "pool": ("4",),
@@ -84,7 +85,7 @@ async def test_screen_looks_as_it_did(fleet: "FakeView", screen: str, size: tupl
     await compare_screen(fleet, screen, SCREENS[screen], size, write=screen == "confirm")
 
 
-@pytest.mark.parametrize("screen", ["fleet", "gateway", "pool", "llm", "learning", "run"])
+@pytest.mark.parametrize("screen", ["overview", "fleet", "gateway", "pool", "llm", "learning", "run"])
 @OTHER_SIZES
 async def test_other_sizes_are_never_refused(fleet: "FakeView", screen: str, size: tuple[int, int]) -> None:
     """Narrower and wider than usual, a screen still shows what comes first in it, and no line is too long."""

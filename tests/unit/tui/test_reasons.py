@@ -80,8 +80,8 @@ async def test_a_name_written_wrongly_does_not_stop_nobody(view: "FakeView") -> 
 
 
 SCREENED = {
-    "fleet": "fleet", "tasks": "task list", "robots": "robots list", "pool": "pool list", "llm": "fleet",
-    "learning": "learn list", "log": "task watch", "replay": "log replay",
+    "overview": "alerts list", "fleet": "fleet", "tasks": "task list", "robots": "robots list", "pool": "pool list",
+    "llm": "fleet", "learning": "learn list", "log": "task watch", "replay": "log replay",
 }  # fmt: skip
 """Commands that show what a screen does."""
 ONLY_HERE = {

@@ -78,7 +78,7 @@ class PlainScreen(FleetScreen):
 class PlainApp(SwiftbotApp):
     """The terminal UI with that table on its first screen."""
 
-    MODES = SCREENS | {"fleet": PlainScreen}  # pyright: ignore[reportAssignmentType] - as in the class above
+    MODES = SCREENS | {"overview": PlainScreen}  # pyright: ignore[reportAssignmentType] - as in the class above
 
     @property
     def cursor(self) -> int:
@@ -161,11 +161,11 @@ async def _keys(app: SwiftbotApp, look: Look) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     until = time.monotonic() + look.seconds
     walk = ["down", "down", "pagedown", "up", "down", "pageup"]
-    script = itertools.cycle(walk if look.plain else ["2", *walk, "3", *walk, "1", *walk, "4", *walk])
+    script = itertools.cycle(walk if look.plain else ["0", "2", *walk, "3", *walk, "1", *walk, "4", *walk])
     for key in script:
         if time.monotonic() > until:
             break
-        mode = {"1": "fleet", "2": "tasks", "3": "robots", "4": "pool"}.get(key, "")
+        mode = {"0": "overview", "1": "fleet", "2": "tasks", "3": "robots", "4": "pool"}.get(key, "")
         if mode and app.current_mode == mode:
             continue
         before = _cursor(app)
