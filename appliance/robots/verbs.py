@@ -52,7 +52,7 @@ class Waypoint(Struct, frozen=True, forbid_unknown_fields=True):
     z: float | None = None
 
 
-@arguments_of("state", "land", "return_home", "arm", "disarm", "release")
+@arguments_of("state", "land", "return_home", "arm", "disarm", "release", "scan")
 class NoArgs(Struct, frozen=True, forbid_unknown_fields=True):
     """Verbs that say all by their name."""
 
@@ -193,11 +193,60 @@ class AskArgs(Struct, frozen=True, forbid_unknown_fields=True):
     to: str = ""
 
 
-@arguments_of("open", "close", "switch_on", "switch_off")
+@arguments_of("open", "close", "switch_on", "switch_off", "clean", "cut", "unfasten")
 class NamedArgs(Struct, frozen=True, forbid_unknown_fields=True):
-    """`open`, `close`, `switch_on`, `switch_off`: what is meant, by name."""
+    """`open`, `close`, `switch_on`, `switch_off`, `clean`, `cut`, `unfasten`: what is meant, by name."""
 
     object: str
+
+
+@arguments_of("fasten", "push")
+class NamedToArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`fasten` a part, to something; `push` a thing to a place, or a step ahead."""
+
+    object: str
+    to: str = ""
+
+
+@arguments_of("pour")
+class PourArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`pour`: what is held, into a container within reach."""
+
+    object: str
+    into: str
+
+
+@arguments_of("measure")
+class MeasureArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`measure`: a quantity by name, of a target or where the robot is. Answered with `number` and `unit`."""
+
+    quantity: str
+    target: str = ""
+
+
+@arguments_of("listen")
+class ListenArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`listen`: sound for some seconds, as `sound.wav` of 16-bit samples."""
+
+    duration_s: float
+    target: str = ""
+
+
+@arguments_of("thermal")
+class ThermalArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`thermal`: a picture of temperatures, `thermal.png`: 16 bits a pixel, hundredths of a kelvin."""
+
+    target: str
+
+
+@arguments_of("follow")
+class FollowArgs(Struct, frozen=True, forbid_unknown_fields=True):
+    """`follow`: keep `distance_m` behind a robot or a person that the robot itself sees."""
+
+    target: str
+    duration_s: float
+    distance_m: float = 2.0
+    speed_mps: float | None = None
 
 
 @arguments_of("give")

@@ -13,8 +13,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
-from appliance.model import Pose
-from workshop.robots.world import Aim, World
+from appliance.model import Pose, Site
+from workshop.robots.world import ON, Aim, World
 
 EYE_M = 1.0
 """Height of the camera above the ground."""
@@ -78,6 +78,41 @@ def render(world: World, pose: Pose, view: Aim, *, robot: str, width: int = WIDT
     return Image.fromarray(picture)
 
 
+AIR_C, WARM_C, SUN_C = 20.0, 55.0, 24.0
+"""Temperature of everything, of a device that is on, and of the ground outside."""
+
+
+def temperatures(world: World, pose: Pose, view: Aim, *, robot: str) -> Floats:
+    """Return what its thermal camera sees, degrees Celsius, half as wide and high as pictures are."""
+    eye = np.array([pose.x, pose.y, EYE_M], dtype=np.float32)
+    rays = _rays(view, WIDTH // 2, HEIGHT // 2)
+    inverse: list[Floats] = [np.ascontiguousarray(1.0 / rays[..., axis]) for axis in range(3)]
+    celsius = np.where(rays[..., 2] < 0, np.float32(SUN_C), np.float32(AIR_C))
+    depth = np.full(rays.shape[:2], _FAR_M, dtype=np.float32)
+    warm = {(each.x, each.y) for each in world.things if each.state == ON}
+    for solid in _solids(world, pose, robot):
+        middle = tuple(round((low + high) / 2, 3) for low, high in zip(solid.low[:2], solid.high[:2], strict=True))
+        hit, near, _ = _met(solid, eye, inverse, depth)
+        celsius[hit] = WARM_C if middle in {(round(x, 3), round(y, 3)) for x, y in warm} else AIR_C
+        depth[hit] = near[hit]
+    return celsius
+
+
+def reach(site: Site, pose: Pose, bearings: Floats, most_m: float) -> Floats:
+    """Return how far beams at these compass bearings (radians) get to an obstacle or the fence, `most_m` at most."""
+    slopes = [1.0 / np.where(np.abs(each) < 1e-6, 1e-6, each) for each in (np.sin(bearings), np.cos(bearings))]
+    found = np.full(bearings.shape, most_m, dtype=np.float64)
+    boxes = [(box, False) for box in site.obstacles] + ([(site.fence, True)] if site.fence is not None else [])
+    for box, inside in boxes:
+        enters, leaves = np.full(bearings.shape, -np.inf), np.full(bearings.shape, np.inf)
+        for slope, (low, high), at in zip(slopes, (box.x, box.y), (pose.x, pose.y), strict=True):
+            one, other = (low - at) * slope, (high - at) * slope
+            enters, leaves = np.maximum(enters, np.minimum(one, other)), np.minimum(leaves, np.maximum(one, other))
+        hit = (enters < leaves) & (leaves > 0)
+        found = np.where(hit, np.minimum(found, np.where(inside | (enters < 0), leaves, enters)), found)
+    return np.maximum(found, 0.0).astype(np.float32)
+
+
 def png(picture: Image.Image) -> bytes:
     """Encode as PNG."""
     out = io.BytesIO()
@@ -139,22 +174,23 @@ def _solids(world: World, pose: Pose, robot: str) -> list[_Solid]:
 
 def _draw(solid: _Solid, eye: Floats, inverse: list[Floats], picture: Pixels, depth: Floats) -> None:
     """Paint a box where it is nearer than what is there; `inverse` holds one over each ray's x, y and z."""
-    near = far = face = None
+    hit, near, face = _met(solid, eye, inverse, depth)
+    if hit.any():
+        shades = np.array(_SHADES, dtype=np.float32)[face[hit]][:, None]
+        picture[hit] = (np.array(solid.colour, dtype=np.float32) * shades).astype(np.uint8)
+        depth[hit] = near[hit]
+
+
+def _met(
+    solid: _Solid, eye: Floats, inverse: list[Floats], depth: Floats
+) -> tuple[NDArray[np.bool_], Floats, NDArray[np.uint8]]:
+    """Return which rays meet a box before what is there, how far away, and across which axis its face lies."""
+    near, far = np.full(depth.shape, -np.inf, dtype=np.float32), np.full(depth.shape, np.inf, dtype=np.float32)
+    face = np.zeros(depth.shape, dtype=np.uint8)
     for axis, slope in enumerate(inverse):
         one = (solid.low[axis] - float(eye[axis])) * slope
         other = (solid.high[axis] - float(eye[axis])) * slope
         enters, leaves = np.minimum(one, other), np.maximum(one, other)
-        if near is None or far is None or face is None:
-            near, far, face = enters, leaves, np.zeros(enters.shape, dtype=np.uint8)
-            continue
-        later = enters > near
-        face[later] = axis
+        face[enters > near] = axis
         near, far = np.maximum(near, enters), np.minimum(far, leaves)
-    if near is None or far is None or face is None:
-        return
-    hit = (near < far) & (near > 0.05) & (near < depth)
-    if not hit.any():
-        return
-    shades = np.array(_SHADES, dtype=np.float32)[face[hit]][:, None]
-    picture[hit] = (np.array(solid.colour, dtype=np.float32) * shades).astype(np.uint8)
-    depth[hit] = near[hit]
+    return (near < far) & (near > 0.05) & (near < depth), near, face

@@ -41,6 +41,8 @@ class Thing(Struct, frozen=True, kw_only=True):
     holder: str = ""
     state: str = ""
     """Of a door `open` or `closed`, of a device `on` or `off`; empty for what has no state."""
+    condition: str = ""
+    """What a robot made of it: `clean`, `cut`, `loose`, …"""
     counter: int = 0
     writer: str = ""
 
@@ -165,6 +167,29 @@ class World:
     def pick(self, robot: str, thing: Thing) -> Thing:
         """Put the thing into the robot's hand; returns the change to tell the others."""
         return self._change(thing, robot, holder=robot)
+
+    def check_reach(self, robot: str, name: str, pose: Pose, *, what: str) -> Thing:
+        """Return the thing of that name that the arm reaches, or holds; RobotFailure says why not."""
+        thing = self.find(name, pose.x, pose.y)
+        if thing is None:
+            raise RobotFailure(
+                "not-found", f"there is no {name[:60]!r} here to {what}", remedy=f"there are: {_names(self.things)}"
+            )
+        if thing.holder not in ("", robot):
+            raise RobotFailure("precondition", f"the {thing.name} is held by {thing.holder}", retryable=True)
+        distance = 0.0 if thing.holder else self._distance(thing, pose)
+        if distance > REACH_M:
+            near = self.nearest_place(thing.x, thing.y)
+            raise RobotFailure(
+                "precondition",
+                f"the {thing.name} is {distance:.1f} m away, the arm reaches {REACH_M:g} m",
+                remedy=f"drive to {near} first" if near else "drive there first",
+            )
+        return thing
+
+    def become(self, robot: str, thing: Thing, condition: str) -> Thing:
+        """Leave a thing in another condition; returns the change to tell the others."""
+        return self._change(thing, robot, condition=condition)
 
     def check_place(self, robot: str, name: str, at: str, pose: Pose) -> tuple[Thing, float, float]:
         """Return the held thing and the spot to put it down; RobotFailure says why not."""

@@ -45,6 +45,7 @@ from workshop.robots.around import Around
 from workshop.robots.driving import Driving
 from workshop.robots.ears import Ears
 from workshop.robots.mavlink import start_point
+from workshop.robots.tools import Tools
 from workshop.robots.world import WORLD, WORLD_OF, Aim, Thing, Things, World, aim, words
 
 log = structlog.get_logger(__name__)
@@ -141,6 +142,16 @@ class Rover:
         self._around = Around(
             self.name, self.world, pose=lambda: self.driving.pose, wait=self._wait, announce=self._announce
         )
+        self._tools = Tools(
+            self.name,
+            self.world,
+            self.driving,
+            session,
+            site=self._open_site,
+            wait=self._wait,
+            announce=self._announce,
+            drive=self._drive,
+        )
         self.desk = CommandExecutor(
             self.name,
             session=session,
@@ -163,6 +174,7 @@ class Rover:
             "capture": Verb(run=self._capture, uses=("camera",), resumable=True),
             "record": Verb(run=self._record, uses=("camera",), resumable=True),
             **self._around.verbs(),
+            **self._tools.verbs(),
         }
 
     async def run(self, stop: asyncio.Event) -> None:

@@ -60,17 +60,29 @@ def plan_way(ctx: Context, start: paths.Point, goal: Spot, *, flies: bool = Fals
     A robot that flies goes round obstacles too where it can (the map gives them no height), over them where the
     start or the goal leaves no other way, and never over a forbidden area.
     """
+    try:
+        return _way(ctx, start, goal, flies=flies)
+    except paths.NoPath as error:
+        raise ctx.CallError("precondition", f"cannot reach {goal.name}: {error.message}", error.remedy) from error
+
+
+def reachable(ctx: Context, before: State, goal: Spot) -> bool:
+    """Whether the map has a way from where the robot is to a spot."""
+    try:
+        return bool(_way(ctx, (before.x, before.y), goal, flies=before.flies))
+    except paths.NoPath:
+        return False
+
+
+def _way(ctx: Context, start: paths.Point, goal: Spot, *, flies: bool) -> list[paths.Point]:
     forbidden = paths.rectangles(ctx.site.get("forbidden") or ())
     obstacles = paths.rectangles(ctx.site.get("obstacles") or ())
     try:
-        try:
-            return paths.plan(start, (goal.x, goal.y), [*obstacles, *forbidden])
-        except paths.NoPath:
-            if not flies:
-                raise
-            return paths.plan(start, (goal.x, goal.y), forbidden)
-    except paths.NoPath as error:
-        raise ctx.CallError("precondition", f"cannot reach {goal.name}: {error.message}", error.remedy) from error
+        return paths.plan(start, (goal.x, goal.y), [*obstacles, *forbidden])
+    except paths.NoPath:
+        if not flies:
+            raise
+        return paths.plan(start, (goal.x, goal.y), forbidden)
 
 
 def go(

@@ -68,6 +68,29 @@ def area(ctx: Context, name: str) -> tuple[float, float, float, float] | None:
     return None
 
 
+AROUND_M = 5.0
+"""What is meant around a place that is a point on the map, metres each way."""
+
+
+def extent(ctx: Context, name: str) -> tuple[float, float, float, float]:
+    """Return (x0, x1, y0, y1) of an area to be covered: mapped, or around a place; within the fence. Never empty."""
+    found = area(ctx, name)
+    if found is None:
+        fence = params.table(ctx.site.get("fence"))
+        if plain(name) in ("site", "everything", "whole site", "yard", plain(str(fence.get("name", "site")))) and fence:
+            found = (float(fence["x"][0]), float(fence["x"][1]), float(fence["y"][0]), float(fence["y"][1]))
+        else:
+            spot = resolve(ctx, name)
+            found = (spot.x - AROUND_M, spot.x + AROUND_M, spot.y - AROUND_M, spot.y + AROUND_M)
+    fence = params.table(ctx.site.get("fence"))
+    if fence:
+        x, y = fence["x"], fence["y"]
+        found = (max(found[0], x[0]), min(found[1], x[1]), max(found[2], y[0]), min(found[3], y[1]))
+    if found[0] >= found[1] or found[2] >= found[3]:
+        raise ctx.CallError("payload", f"{name} lies outside the site's fence", "name an area within it")
+    return found
+
+
 def _check_within(ctx: Context, name: str, x: float, y: float) -> None:
     places: list[dict[str, Any]] = list(params.table(ctx.site.get("places")).values())
     xs = [float(each.get("x", 0.0)) for each in places] or [0.0]

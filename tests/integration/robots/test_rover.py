@@ -63,6 +63,7 @@ class Hall:
         self.commanded: list[RobotCommand] = []
         self.pictures: list[dict[str, Any]] = []
         self.alive: dict[str, bool] = {}
+        self.things: dict[str, dict[str, Any]] = {}
         self.processes: list[asyncio.subprocess.Process] = []
         self.number = 0
         keys = session.keys
@@ -70,6 +71,7 @@ class Hall:
         session.subscribe(
             keys(keyspace.COMMANDED), lambda m: self.commanded.append(msgspec.json.decode(m.payload, type=RobotCommand))
         )
+        session.subscribe(keys(WORLD), lambda m: self.things.update({m.key.rsplit("/", 1)[-1]: json.loads(m.payload)}))
         session.subscribe(keys(keyspace.CAMERA), lambda m: self.pictures.append(json.loads(m.payload)))
         session.watch_alive(
             keys(keyspace.ROBOT_ALIVE), lambda key, alive: self.alive.update({key.split("/")[-2]: alive})
@@ -263,6 +265,63 @@ async def test_doors_devices_and_people(hall: Hall) -> None:
     assert (await hall.done("rover_1", "say", text="here you are")).result["heard_by"] == ["Ann"]
     assert (await hall.done("rover_1", "give", object="red box", to="Ann")).result["to"] == "Ann"
     await until(lambda: hall.infos["rover_1"].holding == "")
+
+
+async def test_tools_work_on_what_is_within_reach(hall: Hall) -> None:
+    """A cover is loosened once for all robots, a bottle is poured, a cart is pushed, and what is too far is refused."""
+    site = Site(
+        places={"charger": Place(x=0.0, y=0.0), "bay": Place(x=6.0, y=0.0)},
+        objects=tuple(SiteObject(name=name, colour="red", at="charger") for name in ("cover", "bottle", "bucket")),
+    )
+    await hall.rover("rover_1", site=site)
+    await hall.rover("rover_2", site=site)
+    for verb, condition in (("unfasten", "loose"), ("clean", "clean"), ("fasten", "fastened"), ("cut", "cut")):
+        assert (await hall.done("rover_1", verb, object="cover")).result["condition"] == condition
+    await until(lambda: hall.things.get("cover", {}).get("condition") == "cut")
+    failure = (await hall.tell("rover_1", "pour", object="bottle", into="bucket")).failure
+    assert failure is not None
+    assert failure.remedy == "pick the bottle first"
+    await hall.done("rover_1", "pick", object="bottle")
+    assert (await hall.done("rover_1", "pour", object="bottle", into="bucket")).result["into"] == "bucket"
+    await hall.done("rover_1", "place", object="bottle", at="here")
+    assert (await hall.done("rover_1", "push", object="cover", to="bay")).result["pushed_m"] == 6.0
+    assert (await hall.tell("rover_2", "push", object="cover")).failure is not None  # it is 6 m away now
+    failure = (await hall.tell("rover_2", "clean", object="ladder")).failure
+    assert failure is not None
+    assert failure.code == "not-found"
+
+
+async def test_a_rover_follows_another_and_measures(hall: Hall) -> None:
+    """It keeps two metres behind; a device that is switched on is warm and is heard; a wall is seen by the scan."""
+    site = Site(
+        places={"charger": Place(x=0.0, y=0.0), "pump room": Place(x=8.0, y=0.0)},
+        obstacles=(Box(name="wall", x=(-5.0, 20.0), y=(4.0, 5.0)),),
+        devices=(Device(name="pump", at="pump room"),),
+    )
+    await hall.rover("rover_1", site=site)
+    await hall.rover("rover_2", site=site)
+    follow = asyncio.create_task(hall.tell("rover_2", "follow", target="rover_1", duration_s=5.0))
+    await hall.done("rover_1", "goto", waypoints=[{"x": 7.0, "y": 0.0}])
+    followed = await follow
+    assert followed.failure is None
+    assert followed.result["in_sight"] is True
+    await until(lambda: abs(hall.infos["rover_2"].pose.x - 5.0) < 0.5)  # pyright: ignore[reportOptionalMemberAccess]
+    assert (await hall.done("rover_1", "measure", quantity="temperature", target="pump")).result["number"] == 20.0
+    before = (await hall.done("rover_1", "measure", quantity="noise")).result["number"]
+    await hall.done("rover_1", "switch_on", object="pump")
+    assert (await hall.done("rover_1", "measure", quantity="temperature", target="pump")).result["number"] == 55.0
+    assert (await hall.done("rover_1", "measure", quantity="noise")).result["number"] > before
+    thermal = await hall.done("rover_1", "thermal", target="pump")
+    celsius = np.asarray(Image.open(io.BytesIO(thermal.blobs["thermal.png"]))) / 100.0 - 273.15
+    assert (round(celsius.max(), 1), celsius.shape) == (55.0, (120, 160))
+    assert len((await hall.done("rover_1", "listen", duration_s=1.0)).blobs["sound.wav"]) == 16_044
+    scan = (await hall.done("rover_1", "scan")).result
+    assert scan["ranges_m"][0] == pytest.approx(4.0, abs=0.1)
+    assert scan["ranges_m"][90] is None
+    for verb, args in (("measure", {"quantity": "radiation"}), ("follow", {"target": "ghost", "duration_s": 5.0})):
+        failure = (await hall.tell("rover_1", verb, **args)).failure
+        assert failure is not None
+        assert failure.code == "not-found"
 
 
 async def test_people_answer_what_a_skill_asks_through_a_robot(hall: Hall) -> None:

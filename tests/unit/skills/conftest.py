@@ -96,6 +96,16 @@ class FakeContext:
         self.notices.append((to, text))
         return {"notice": f"t1/s1/{len(self.notices)}"}
 
+    def volume(self, name: str) -> Path:
+        """Return a folder that outlives the run."""
+        folder = self.scratch / "volumes" / name
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def host_folder(self, name: str) -> Path:
+        """Return a folder of the machine."""
+        return self.scratch / "folders" / name
+
     def ask(self, question: str, choices: Sequence[str] = (), to: str = "operator", timeout_s: float = 240) -> str:
         """Note the question, and answer as the test says."""
         assert timeout_s > 0

@@ -18,6 +18,8 @@ WITH_HANDLER = {
     "extract_frames", "hold", "return_home", "count", "find", "follow_path", "patrol", "plan_route", "orbit", "track",
     "ask", "wait_for", "train_local", "aggregate", "evaluate",
     "encode_clip", "classify_action", "preprocess_audio", "transcribe", "correct_text",
+    "clean", "cut", "fasten", "unfasten", "pour", "push", "follow", "localize", "measure", "scan_thermal",
+    "record_audio", "map_area", "explore", "split_area", "merge_maps", "compare", "inspect", "match_scene",
 }  # fmt: skip
 MODULES_OF = {"base": set[str](), "vision": {"numpy", "PIL"}}
 MODULES_OF["learn"] = MODULES_OF["vision"] | {"torch", "av", "soundfile", "pocketsphinx"}

@@ -1,0 +1,13 @@
+"""fasten: screw, bolt, tighten or attach a part within reach."""
+
+from typing import Any
+
+from _lib import orders
+from _lib.context import Context
+
+
+def run(ctx: Context) -> dict[str, Any]:
+    """Return what the robot says and what was meant."""
+    return orders.carry_out(
+        ctx, "fasten", ("object",), optional=("to",), doing="fastening {object}", done="{object} is fastened"
+    )

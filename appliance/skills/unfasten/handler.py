@@ -1,0 +1,11 @@
+"""unfasten: unscrew, loosen or detach a part within reach."""
+
+from typing import Any
+
+from _lib import orders
+from _lib.context import Context
+
+
+def run(ctx: Context) -> dict[str, Any]:
+    """Return what the robot says and what was meant."""
+    return orders.carry_out(ctx, "unfasten", ("object",), doing="loosening {object}", done="{object} is loose")
