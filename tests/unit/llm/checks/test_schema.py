@@ -95,9 +95,10 @@ def test_each_problem_is_named(
 
 def test_skill_without_handler_is_refused_when_required(catalogue: Catalogue) -> None:
     """A skill that has no handler is refused at planning time, and only where that was asked for."""
-    missing = next(skill for skill in catalogue.skills.values() if not skill.implemented and not skill.params)
+    missing = next(skill for skill in catalogue.skills.values() if not skill.implemented and not skill.joint)
     robot = "any" if missing.runs == "robot" else None
-    wanted = plan(Subtask(id="s1", skill=missing.id, robot=robot))
+    given = {name: "label" for name, param in missing.params.items() if param.required}
+    wanted = plan(Subtask(id="s1", skill=missing.id, robot=robot, params=given))
     assert validate(wanted, catalogue) == ()
     (problem,) = validate(wanted, catalogue, require_implemented=True)
     assert f"skill {missing.id} is not implemented on this fleet" in problem
