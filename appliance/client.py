@@ -155,6 +155,8 @@ WATCH_SILENCE_S = 3.0
 """Longer than the pause between two signs of life of a run (`pool.runs.ALIVE_S`)."""
 MOST_SILENT = 10
 """Failed looks in a row after which a watcher gives up."""
+SUBMIT_S = 15.0
+"""How long a gateway that takes a task is looked for."""
 STOP_S = 6.0
 """How long a stop waits to be confirmed: by then it has long been put."""
 SWAP_S = 300.0
@@ -537,10 +539,31 @@ class FleetClient(SteeringCalls):
         return await self.plane.rpc.call(gateway, keyspace.EXPERIENCE, asked)
 
     async def submit(self, request: TaskRequest) -> TaskRecord:
-        """Submit a task; durable when this returns. It gets its id here, so that asking twice is one task."""
+        """Submit a task; durable when this returns. It gets its id here, so that asking twice is one task.
+
+        A gateway that is taking too many others says when to come back, which is waited for.
+
+        Raises:
+            RefusedError: the instruction is not taken, or there is no room within `SUBMIT_S`.
+        """
         if not request.id:
             request = replace(request, id=f"t-{uuid.uuid4().hex[:10]}")
-        return await self._ask(keyspace.SUBMIT, request, patience_s=15.0)
+        give_up = time.monotonic() + SUBMIT_S
+        while True:
+            try:
+                return await self.submit_once(request)
+            except RefusedError as error:
+                if not error.retry_after_s or time.monotonic() + error.retry_after_s > give_up:
+                    raise
+                await asyncio.sleep(error.retry_after_s)
+
+    async def submit_once(self, request: TaskRequest) -> TaskRecord:
+        """Submit a task that has an id, at the gateway that will coordinate it; a refusal says when to come back.
+
+        Many tasks are handed in by `submission.submit_all`, which heeds that.
+        """
+        owner = self.plane.ring.owner(f"{keyspace.TASK_RECORD.prefix}{request.id}") if self.plane.members() else ""
+        return await self._ask(keyspace.SUBMIT, request, patience_s=SUBMIT_S, first=owner)
 
     async def task(self, task: str) -> TaskRecord:
         """One task's record."""

@@ -105,18 +105,29 @@ class FleetConnection:
         return await self.plane.any_gateway()
 
     async def _ask(
-        self, verb: Verb[Q, R], request: Q, *, timeout_s: float | None = None, patience_s: float = PATIENCE_S
+        self,
+        verb: Verb[Q, R],
+        request: Q,
+        *,
+        timeout_s: float | None = None,
+        patience_s: float = PATIENCE_S,
+        first: str = "",
     ) -> R:
-        """Ask any gateway, and another one when it is gone or silent: every verb used here may be repeated."""
+        """Ask any gateway, and another one when it is gone or silent: every verb used here may be repeated.
+
+        `first`: the one to ask first, if it is there.
+        """
         give_up = time.monotonic() + patience_s
         silent: set[str] = set()
         while True:
-            gateway = await self.plane.any_gateway(avoid=silent)
+            gateway = first if first not in silent and first in self.plane.members() else ""
+            gateway = gateway or await self.plane.any_gateway(avoid=silent)
             try:
                 return await self.plane.rpc.call(gateway, verb, request, timeout_s=timeout_s)
             except UnreachableError:
                 if time.monotonic() > give_up:
                     raise
+                first = ""
                 await asyncio.sleep(0.1)
             except DeadlineError:
                 # It may be frozen, which is only noticed when its lease ends.

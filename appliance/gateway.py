@@ -650,6 +650,7 @@ class Gateway:
             running=self.executor.running,
             queue=self.pool.queue,
             tasks=self.manager.unfinished,
+            tasks_waiting=self.manager.waiting,
             draining=self._draining or self.executor.draining,
             drain=self.migration.draining.text,
             overloaded=self.migration.shedding.reason,

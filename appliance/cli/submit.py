@@ -22,9 +22,10 @@ from msgspec.structs import replace
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, on_terminal, show
 from appliance.cli.stop import reported_unconfirmed, show_stopped
+from appliance.cli.submit_file import submit_file
 from appliance.client import FleetClient, Stopped, read_plan_file
 from appliance.connection import operator_name
-from appliance.errors import Exit, NotFoundError, SwiftbotError, UnapprovedError
+from appliance.errors import ConfigError, Exit, NotFoundError, SwiftbotError, UnapprovedError
 from appliance.llm.stop_words import stop_request
 from appliance.model import PLAIN_PRIORITY, Approval, Plan, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.tasks.views import view
@@ -36,17 +37,25 @@ def add_to(app: App) -> None:
 
 
 def submit(
-    text: str,
+    text: str = "",
     /,
     *,
+    file: Annotated[
+        Path | None,
+        Parameter(help="Submit the tasks of a file instead: an instruction or a task as JSON in each line."),
+    ] = None,
     wait: Annotated[
         bool,
         Parameter(help="Show progress and wait for the end. Ctrl-C offers to detach or cancel; in scripts it cancels."),
     ] = False,
     task_id: Annotated[str, Parameter(name="--id", help="Task ID; submitting the same one twice is one task.")] = "",
     priority: Annotated[
-        int, Parameter(help="Priority, 0 (lowest) to 9.", validator=Number(gte=0, lte=9))
-    ] = PLAIN_PRIORITY,
+        int | None,
+        Parameter(
+            help=f"Priority, 0 (lowest) to 9; if not given {PLAIN_PRIORITY}, of a file {PLAIN_PRIORITY - 1}.",
+            validator=Number(gte=0, lte=9),
+        ),
+    ] = None,
     deadline: Annotated[
         float,
         Parameter(help="Seconds from now after which it fails; 0: none.", validator=Number(gte=0)),
@@ -64,17 +73,31 @@ def submit(
     On a terminal the plan is shown before it runs and runs when it is confirmed; in scripts the policy of the fleet
     decides which plans wait for approval. A text that says to stop ("stop", "halt", "rover_1: stop") is not a task: it
     is the soft stop, at once, of the robots named, else of all, as `swiftbot stop` does it.
+
+    With --file each line is a JSON text (the instruction) or an object with `instruction` and any of `id`, `priority`,
+    `deadline_s`, `group`, `approval`, `plan`; the options count for lines that do not say it. Tasks are accepted in
+    their order, as fast as the fleet takes them; a line that is wrong is named and the others go on. Returns when all
+    are accepted; Ctrl-C stops before.
     """
+    if (file is None) == (not text) or (file is not None and wait):
+        raise ConfigError(
+            "--wait is for a single instruction" if text or wait else "there is no instruction",
+            remedy="give an instruction, or --file without --wait",
+        )
+    if priority is None:
+        priority = PLAIN_PRIORITY if file is None else PLAIN_PRIORITY - 1
     # The id is chosen here: an interrupt while the task is being submitted must know what to cancel.
     request = TaskRequest(
         instruction=text,
-        id=task_id or f"t-{uuid.uuid4().hex[:10]}",
+        id=task_id or ("" if file is not None else f"t-{uuid.uuid4().hex[:10]}"),
         submitter=operator_name(),
         priority=priority,
         deadline_s=deadline,
         group=group,
         approval=approval,
     )
+    if file is not None:
+        return submit_file(file, request, where, as_json=as_json)
     shown = not yes and not as_json and on_terminal()
     with reported_unconfirmed(stop_request(text) is not None):
         submitting = Submitting(request, where, wait=wait, quiet=as_json)

@@ -186,6 +186,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     queue: int = 0
     tasks: int = 0
     """Tasks it coordinates that have not ended."""
+    tasks_waiting: int = 0
+    """Of these, those that wait for their turn."""
     draining: bool = False
     drain: str = ""
     """While it drains: how far it is, and what the runs that are left wait for."""

@@ -22,10 +22,11 @@ membership differ for a moment, or a partition) make concurrent versions, which 
 
 import asyncio
 import contextlib
+import math
 import random
 import secrets
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from functools import partial
 from typing import Any
@@ -241,6 +242,8 @@ _PUSH_S = 1.5
 _PUSH_AGAIN_S = (0.5, 2.0)
 """When a replica that was too slow for a write is offered the record again."""
 _MOST_PUSHED = 256
+_TELL_S = 60.0
+"""Between two warnings of slow replicas: they are slow together, when the machine or the network is."""
 
 
 class Push:
@@ -279,6 +282,9 @@ class Pushing:
         self._membership = membership
         self._keep = keep
         self._pushes = Background()
+        self._slow: Counter[str] = Counter()
+        """Writes that replicas did not confirm in time since that was told last, by replica."""
+        self._told_at = -math.inf
 
     def begin(self, gateway: str, record: Record, *, durable: bool = True) -> "Push":
         """Send a replica a record to store; what comes of it is awaited afterwards."""
@@ -303,7 +309,11 @@ class Pushing:
         if isinstance(error, UnreachableError):
             return  # gone: its successor in the replica set takes the record when it reconciles
         if isinstance(error, DeadlineError | RefusedError):
-            log.warning("a replica is slow", replica=gateway, key=record.key, reason=str(error))
+            self._slow[gateway] += 1
+            if (now := time.monotonic()) >= self._told_at + _TELL_S:
+                log.warning("replicas are slow", writes=dict(self._slow), key=record.key, reason=str(error))
+                self._told_at = now
+                self._slow.clear()
             self._later(self._push_again(gateway, record.key))
         else:
             log.error("a replica cannot store", replica=gateway, key=record.key, reason=str(error))

@@ -8,7 +8,8 @@ gateway is composed of these. For
 runs that are of no task: `orders.need_of`, `checkpoints.Checkpoint` and `checkpoints.checkpoint_key`. For clients:
 `stream.Kept`, `stream.Stream`, `views`, `history`, `replay`, `records.clean` and `records.done_text`.
 
-Pure: `records` and `model.transitions` (what is kept and what happens), `machine` (the state machine), `replan`,
+Pure: `queue` (whose turn it is),
+`records` and `model.transitions` (what is kept and what happens), `machine` (the state machine), `replan`,
 `placement`, `views`, `settings`.
 
 At the coordinator of a task: `manager` (accepts tasks and drives those whose key it owns), `endpoints` (answers for

@@ -5,7 +5,7 @@ import math
 import time
 import uuid
 from collections import Counter, deque
-from collections.abc import Collection, Generator, Mapping
+from collections.abc import Awaitable, Callable, Collection, Generator, Mapping
 
 from msgspec.structs import replace
 
@@ -13,7 +13,16 @@ from appliance.errors import PayloadError, RefusedError
 from appliance.llm.preprocessing import stop_refused, training_refused
 from appliance.llm.stop_words import stop_request
 from appliance.llm.training_words import training_request
-from appliance.model import HIGHEST_PRIORITY, LONGEST_DEADLINE_S, PLAIN_PRIORITY, SPLIT, Plan, TaskRequest, oversize
+from appliance.model import (
+    HIGHEST_PRIORITY,
+    LONGEST_DEADLINE_S,
+    PLAIN_PRIORITY,
+    SPLIT,
+    Plan,
+    TaskRecord,
+    TaskRequest,
+    oversize,
+)
 from appliance.model.keys import check_name
 from appliance.tasks.records import MAX_DEPTH, too_deep
 from appliance.tasks.settings import TasksConfig
@@ -23,6 +32,13 @@ ENDS = 32
 """Ends of tasks from which the rate is measured: enough for a mean, few enough to follow a change."""
 LONGEST_RETRY_S = 600.0
 """Nobody is sent away for longer: so far ahead the rate says nothing."""
+SLOW_S, SLOWER = 0.03, 4.0
+"""Acceptances are slow that take longer on average, and so many times as long as the quickest one: on an idle machine
+one takes 5 to 10 ms."""
+RECENT_S = 0.5
+"""So long after the last acceptance it does not matter any more how long they took."""
+SHORTEST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
+"""Within these one comes back that has come while too many others were being taken."""
 
 
 def checked(request: TaskRequest, config: TasksConfig) -> TaskRequest:
@@ -76,23 +92,23 @@ def refuse_commands(request: TaskRequest, robots: Collection[str]) -> None:
 
 
 class Ends:
-    """When tasks ended here, from which is measured how fast they do. The clock is passed in."""
+    """When something ended here, from which is measured how fast that goes. The clock is passed in."""
 
     def __init__(self) -> None:
         self._at: deque[float] = deque(maxlen=ENDS)
 
     def ended(self, now: float) -> None:
-        """Note that a task has ended."""
+        """Note that one has ended."""
         self._at.append(now)
 
     def rate(self, now: float) -> float:
-        """Tasks a second of late; 0 when fewer than two have ended. It falls while none ends."""
+        """Ends a second of late; 0 when fewer than two have ended. It falls while none ends."""
         if len(self._at) < 2:
             return 0.0
         return len(self._at) / max(1e-3, now - self._at[0])
 
     def retry_after_s(self, ends: int, now: float) -> float:
-        """Seconds until so many more tasks will have ended; 0: not known."""
+        """Seconds until so many more will have ended; 0: not known."""
         rate = self.rate(now)
         return min(LONGEST_RETRY_S, round(ends / rate, 1)) if rate else 0.0
 
@@ -102,29 +118,69 @@ class Admission:
 
     def __init__(self, gateway: str, most: int) -> None:
         self.ends = Ends()
+        """Of tasks."""
         self._gateway = gateway
         self._most = most
         self._coming: Counter[str] = Counter()
         """As often as each is being asked for at this moment."""
+        self._took_s = 0.0
+        """How long acceptances take, a mean of the last ten or so."""
+        self._quickest_s = math.inf
+        self._last = -math.inf
+        """When the last one ended."""
+
+    def slow(self, now: float) -> bool:
+        """Whether tasks are being accepted just now, and that takes long."""
+        least_s = max(SLOW_S, SLOWER * self._quickest_s)
+        return self._took_s > least_s and (bool(self._coming) or now - self._last < RECENT_S)
 
     @contextlib.contextmanager
-    def one_more(self, task: str, driven: Collection[str]) -> Generator[None]:
-        """Count a task in while it is being accepted; `driven`: those that were.
+    def one_more(self, task: str, unfinished: int) -> Generator[None]:
+        """Count a task in while it is being accepted; `unfinished`: those that were.
 
         Raises:
             RefusedError: the gateway has as many as it may have.
         """
-        unfinished = len({*driven, *self._coming})
+        unfinished += len(self._coming)
         over = unfinished + 1 - self._most
         if over > 0 and task not in self._coming:
             raise full(self._gateway, unfinished, self.ends.retry_after_s(over, time.monotonic()))
         self._coming[task] += 1
+        began = time.monotonic()
         try:
             yield
         finally:
+            self._last = time.monotonic()
+            took_s = self._last - began
+            self._took_s += 0.1 * (took_s - self._took_s)
+            self._quickest_s = min(self._quickest_s, took_s)
             self._coming[task] -= 1
             if not self._coming[task]:
                 del self._coming[task]
+
+    def paced(
+        self, handler: Callable[[TaskRequest], Awaitable[TaskRecord]], *, most: int
+    ) -> Callable[[TaskRequest], Awaitable[TaskRecord]]:
+        """Return a handler of submissions that has at most so many under way at once, and tells others when to return.
+
+        So submissions take neither the time nor the room of other questions, however many there are.
+        """
+        under_way, ends = 0, Ends()
+
+        async def answer(request: TaskRequest) -> TaskRecord:
+            nonlocal under_way
+            if under_way >= most:
+                rate = ends.rate(time.monotonic())
+                pause_s = most / 2 / rate if rate else LONGEST_PAUSE_S
+                raise busy(self._gateway, under_way, min(LONGEST_PAUSE_S, max(SHORTEST_PAUSE_S, pause_s)))
+            under_way += 1
+            try:
+                return await handler(request)
+            finally:
+                under_way -= 1
+                ends.ended(time.monotonic())
+
+        return answer
 
 
 def full(gateway: str, unfinished: int, retry_after_s: float) -> RefusedError:
@@ -134,6 +190,15 @@ def full(gateway: str, unfinished: int, retry_after_s: float) -> RefusedError:
         f"{gateway} already coordinates {unfinished} unfinished tasks",
         remedy=f"{when}, or cancel some",
         retry_after_s=retry_after_s,
+    )
+
+
+def busy(gateway: str, under_way: int, retry_after_s: float) -> RefusedError:
+    """Return the refusal of a gateway that is taking as many tasks as it can at once."""
+    return RefusedError(
+        f"{gateway} is taking {under_way} other tasks just now",
+        remedy=f"submit it again in {retry_after_s:.2g} s",
+        retry_after_s=round(retry_after_s, 3),
     )
 
 
@@ -155,7 +220,13 @@ def longest_s(plan: Plan, seconds: Mapping[str, float]) -> float:
 
 
 def expectation(
-    *, waiting: int, wait_s: float | None, work_s: float | None, deadline_s: float, elapsed_s: float = 0.0
+    *,
+    waiting: int,
+    wait_s: float | None,
+    work_s: float | None,
+    deadline_s: float,
+    elapsed_s: float = 0.0,
+    tasks_before: int = 0,
 ) -> str:
     """Return what a task must expect, in words; empty when it can start at once and has time enough.
 
@@ -165,8 +236,11 @@ def expectation(
         work_s: how long its plan takes when nothing waits; None: there is no plan yet.
         deadline_s: from acceptance; 0: none.
         elapsed_s: since acceptance.
+        tasks_before: tasks that wait for their turn at its coordinator.
     """
     told: list[str] = []
+    if tasks_before:
+        told.append(f"{tasks_before:,} tasks wait for their turn at its coordinator")
     if waiting:
         when = "" if wait_s is None else f", it is expected to start in about {max(0.1, wait_s):.1f} s"
         told.append(f"{waiting} subtasks wait for room before it{when}")

@@ -97,7 +97,7 @@ class Context(Struct, frozen=True, kw_only=True):
         durations = self.ahead.durations
         return durations.of(skill, params) if durations.seen(skill) else 0.0
 
-    def expect(self, plan: Plan | None, *, deadline_s: float, elapsed_s: float = 0.0) -> str:
+    def expect(self, plan: Plan | None, *, deadline_s: float, elapsed_s: float = 0.0, tasks_before: int = 0) -> str:
         """Say in words what a task must expect: a wait, a deadline that can hardly be met; "" when nothing."""
         line, work_s = self.scheduler.line, None
         if plan is not None:
@@ -105,6 +105,7 @@ class Context(Struct, frozen=True, kw_only=True):
             seen = [subtask for subtask in plan.subtasks if durations.seen(subtask.skill)]  # no warning from a guess
             work_s = longest_s(plan, {subtask.id: durations.of(subtask.skill, subtask.params) for subtask in seen})
         return expectation(
+            tasks_before=tasks_before,
             waiting=len(line),
             wait_s=line.expected_s(len(line) + 1),
             work_s=work_s,

@@ -10,10 +10,13 @@
 
 import asyncio
 import contextlib
+import heapq
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TypeVar
 
+import msgspec
+from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, DeadlineError, NotFoundError, PayloadError, SwiftbotError, UnreachableError
@@ -57,6 +60,13 @@ READ_AT_ONCE = 200
 """Records that are decoded before others have their turn."""
 
 
+class _Head(Struct):
+    """The part of a record that tells its place in the order."""
+
+    id: str
+    created_ns: int = 0
+
+
 async def newest_tasks(plane: Plane, ask: TasksAsk, driven: Iterable[TaskRecord]) -> TaskList:
     """Return the newest tasks; gateways that do not answer in time are named.
 
@@ -65,6 +75,7 @@ async def newest_tasks(plane: Plane, ask: TasksAsk, driven: Iterable[TaskRecord]
         ask: how many, and whether of this gateway's shard alone.
         driven: records of tasks that are driven here, which may be newer than those written.
     """
+    heads: list[tuple[history.Place, bytes]] = []
     found: dict[str, TaskRecord] = {}
     filtered = history.is_filtered(ask)
     # Without what is only remembered, unless it is asked for: there is too much of it to be read each time.
@@ -74,8 +85,17 @@ async def newest_tasks(plane: Plane, ask: TasksAsk, driven: Iterable[TaskRecord]
         # A filter looks at what the owner has: by an older copy a task may match that does not any more.
         if stored.deleted or (filtered and not plane.dht.owns(stored.key)):
             continue
+        if not filtered:  # ten thousand may wait: only those that are answered are decoded whole
+            with contextlib.suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+                head = msgspec.json.decode(stored.value, type=_Head)
+                heads.append(((head.created_ns, head.id), stored.value))
+            continue
         with contextlib.suppress(PayloadError):
             record = read_record(stored.value)
+            found[record.id] = record
+    for _, value in heapq.nlargest(max(0, ask.limit) + 1, heads):
+        with contextlib.suppress(PayloadError):
+            record = read_record(value)
             found[record.id] = record
     found.update({record.id: record for record in driven})
     most_bytes = plane.config.max_payload_bytes // 2
@@ -209,7 +229,17 @@ CANCEL_S = 1.5
 
 
 class Questions:
-    """Answers on one gateway. `sweep`: set to have tasks taken up that are owned here and not driven yet."""
+    """Answers on one gateway.
+
+    Args:
+        plane: the fleet.
+        coordinators: of the tasks that are worked on here.
+        scheduler: where their subtasks go.
+        durations: how long subtasks take.
+        sweep: set to have tasks taken up that are owned here and not known yet.
+        hurry: takes a task up that waits for its turn.
+        place: what a task that waits for its turn waits for, in words; "" for any other.
+    """
 
     def __init__(
         self,
@@ -219,12 +249,16 @@ class Questions:
         scheduler: Scheduler,
         durations: Durations,
         sweep: asyncio.Event,
+        hurry: Callable[[str], Awaitable[None]],
+        place: Callable[[str], str],
     ) -> None:
         self._plane = plane
         self._coordinators = coordinators
         self._scheduler = scheduler
         self._durations = durations
         self._sweep = sweep
+        self._hurry = hurry
+        self._place = place
 
     async def task(self, ask: TaskAsk) -> TaskRecord:
         """Return a task's record; NotFoundError when there is none.
@@ -255,7 +289,8 @@ class Questions:
         owner = self._plane.ring.owner(task_key(ask.id))
         if not (record.state.final or ask.here or owner == self._plane.gateway):
             return await self._plane.rpc.call(owner, keyspace.WHY, replace(ask, here=True))
-        return why(record, ask.subtask)
+        found = why(record, ask.subtask)
+        return replace(found, waits=self._place(ask.id) or found.waits)
 
     async def tasks(self, ask: TasksAsk) -> TaskList:
         """Return the newest tasks, of the whole fleet or of this gateway's shard."""
@@ -284,6 +319,7 @@ class Questions:
             UnreachableError: nobody coordinates it just now.
         """
         for _ in range(20):
+            await self._hurry(ask.id)
             if coordinator := self._coordinators.get(ask.id):
                 coordinator.put(CancelAsked(Word(by=ask.by, why=ask.why, act=ask.act, at_ns=time.time_ns())))
                 with contextlib.suppress(TimeoutError):
@@ -318,6 +354,7 @@ class OperatorVerbs:
         coordinators: of the tasks that are coordinated here.
         task: returns a task's record.
         drive: begins to drive a record at a version, as it is stored.
+        hurry: takes a task up that waits for its turn.
         published: hears of each transition that is published.
         audit: of this gateway.
     """
@@ -329,6 +366,7 @@ class OperatorVerbs:
         *,
         task: Callable[[TaskAsk], Awaitable[TaskRecord]],
         drive: Callable[[TaskRecord, VersionVector, bytes], None],
+        hurry: Callable[[str], Awaitable[None]],
         published: Callable[[Transition], None],
         audit: Audit,
     ) -> None:
@@ -336,6 +374,7 @@ class OperatorVerbs:
         self._coordinators = coordinators
         self._task = task
         self._drive = drive
+        self._hurry = hurry
         self._published = published
         self._audit = audit
 
@@ -382,6 +421,7 @@ class OperatorVerbs:
     async def _here(self, ask: Ask) -> TaskRecord:
         """Hand it to the task's coordinator; waits a moment for one that is being set up."""
         for _ in range(TRIES):
+            await self._hurry(ask.id)
             if coordinator := self._coordinators.get(ask.id):
                 outcome: asyncio.Future[TaskRecord] = asyncio.get_running_loop().create_future()
                 coordinator.put(OperatorAsked(ask=ask, outcome=outcome))

@@ -3,6 +3,8 @@
 A task belongs to the gateway that owns `task/{id}` on the ring. Submissions are handed there, and acknowledged
 when the record is durable on it and on its replicas.
 
+Of those whose keys it owns it works on `tasks.max_tasks` at once; the others wait their turn (`queue`).
+
 Takeover: when the ring changes, and now and then, every gateway looks through its shard. An unfinished task whose key
 it now owns gets a coordinator here, one that it owns no longer loses it: a dead gateway's tasks are driven by the next
 owner from the replicated record. A coordinator that breaks is followed by another, later each time.
@@ -20,6 +22,7 @@ from collections.abc import Callable, Mapping
 
 import structlog
 
+from appliance.background import Background
 from appliance.errors import ConflictError, DeadlineError, PayloadError, SwiftbotError, UnreachableError
 from appliance.llm.cascade import Decomposer
 from appliance.llm.settings import OutOfUse
@@ -30,6 +33,7 @@ from appliance.model import (
     Subtask,
     TaskRecord,
     TaskRequest,
+    TaskState,
     VersionVector,
     encode,
     keyspace,
@@ -52,15 +56,21 @@ from appliance.tasks.events import GatewayLost, GatewayRelinked, RunReported, Wa
 from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.plans import Plans
+from appliance.tasks.queue import TaskQueue, Waiting
 from appliance.tasks.record_writer import Draft, RecordWriter
 from appliance.tasks.records import MAX_TEXT, PREFIX, answered, clean, read_record, task_key, unknown, unsound
 from appliance.tasks.retention import TRIMMED
 from appliance.tasks.scheduler import Scheduler
 from appliance.tasks.settings import TasksConfig
-from appliance.tasks.timing import Ages
+from appliance.tasks.timing import Ages, left_s
 
 log = structlog.get_logger(__name__)
 
+SUBMITTED_AT_ONCE = 32
+"""Submissions of one gateway under way at once, the others are told when to come back: so one takes no longer than 32
+do, 0.2 s, and the gateway has time for everything else."""
+ACCEPTED_AT_ONCE = 128
+"""The same of those that other gateways hand on."""
 SWEEP_S = 15.0
 """How often the shard is looked through when the ring stands still."""
 MAX_BREAKS = 6
@@ -70,16 +80,23 @@ SETTLED_S = 1.0
 as while the membership settles, would overtake each other as fast as they can write."""
 AGAIN_S = (0.5, 1.5, 4.0)
 """When the shard is looked through again after the ring has changed."""
+TURN_S = 0.1
+"""How often it is looked whose turn it is."""
+APART_S = 0.25
+"""Between two turns of one submitter while acceptances are slow."""
+READ_AT_ONCE = 200
+"""Records that are decoded before others have their turn."""
 
 
 class Takeover:
-    """The coordinators of one gateway: those of the unfinished tasks whose keys it owns.
+    """The coordinators of one gateway: of the unfinished tasks whose keys it owns, those whose turn it is.
 
     Args:
         context: the parts of the gateway.
         coordinators: by task; kept here.
         sweep: set to have the shard looked through at once.
         ages: of the tasks whose records are seen.
+        slow: whether acceptances are slow, by the monotonic clock.
         moved: gets each record that a coordinator has written.
         ended: gets each coordinator that has come to its end.
         changed: called when the coordinators are other ones.
@@ -92,19 +109,26 @@ class Takeover:
         *,
         sweep: asyncio.Event,
         ages: Ages,
+        slow: Callable[[float], bool],
         moved: Callable[[TaskRecord], None],
         ended: Callable[[Coordinator], None],
         changed: Callable[[], None],
     ) -> None:
+        self.queue = TaskQueue()
+        """The tasks that wait for their turn."""
         self._coordinators = coordinators
         self._sweep = sweep
         self._context = context
         self._plane = context.plane
         self._ages = ages
+        self._slow = slow
         self._moved = moved
         self._ended = ended
         self._changed = changed
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._beginning: dict[str, Waiting] = {}
+        """Tasks whose turn has come and whose records are being read."""
+        self._reading = Background()
         self._breaks: Counter[str] = Counter()
         """How often a task's coordinator has broken; each time it is left alone for longer, in the end given up."""
         self._why: dict[str, Failure] = {}
@@ -117,6 +141,7 @@ class Takeover:
         self._since: dict[str, float] = {}
         """Since when each task is driven here, on the monotonic clock."""
         self._sweeper: asyncio.Task[None] | None = None
+        self._turning: asyncio.Task[None] | None = None
         self._unwatch: Callable[[], None] = lambda: None
         self._stopping = False
 
@@ -127,7 +152,102 @@ class Takeover:
             lambda key: key.startswith(PREFIX) and key[len(PREFIX) :] in self._coordinators, self._changed_here
         )
         self._sweeper = asyncio.create_task(self._keep_sweeping(), name="task takeover")
+        self._turning = asyncio.create_task(self._keep_turning(), name="turns of tasks")
         self._sweep.set()
+
+    def __contains__(self, task: str) -> bool:
+        """Whether a task is worked on here, or waits for its turn."""
+        return task in self._coordinators or task in self.queue or task in self._beginning
+
+    @property
+    def at_work(self) -> int:
+        """Tasks that are worked on."""
+        return len(self._coordinators) + len(self._beginning)
+
+    def take(self, record: TaskRecord, version: VersionVector, value: bytes = b"") -> None:
+        """Drive a task, or have one that has not begun wait for its turn; `value` as of `drive`."""
+        if record.id in self or self._stopping:
+            return
+        now = time.monotonic()
+        full = len(self.queue) > 0 or self.at_work >= self._context.config.max_tasks or self._slow(now)
+        if record.state is not TaskState.ACCEPTED or not full:
+            self.drive(record, version, value)
+            return
+        waiting = Waiting(
+            id=record.id,
+            submitter=record.submitter,
+            priority=record.priority,
+            accepted_ns=record.created_ns,
+            due_at=now + left_s(record, self._ages.elapsed_s(record)),
+        )
+        self.queue.add(waiting, now)
+        self._give_turns()
+
+    def _give_turns(self) -> None:
+        """Take up the tasks whose turn it is."""
+        if self._stopping or not len(self.queue):
+            return
+        now, most = time.monotonic(), self._context.config.max_tasks
+        for task in self.queue.overdue(now):  # its coordinator ends it
+            self._begin(task)
+        at_work = [(each.record.submitter, each.record.priority) for each in self._coordinators.values()]
+        at_work += [(each.submitter, each.priority) for each in self._beginning.values()]
+
+        def busy(submitter: str, priority: int) -> int:
+            return sum(name == submitter and of >= priority for name, of in at_work)
+
+        apart_s = APART_S if self._slow(now) else 0.0
+        while self.at_work < 2 * most:
+            task = self.queue.next(now, room=self.at_work < most, busy=busy, apart_s=apart_s)
+            if task is None:
+                break
+            at_work.append((task.submitter, task.priority))
+            self._begin(task)
+        self._changed()
+
+    def _begin(self, task: Waiting) -> "asyncio.Task[None]":
+        self._beginning[task.id] = task
+        return self._reading.start(self._drive_stored(task.id), f"take up {task.id}")
+
+    async def _drive_stored(self, task: str) -> None:
+        """Drive a task whose turn has come, from its record as it stands."""
+        try:
+            stored = await self._plane.dht.read(task_key(task), replica=True)
+        except UnreachableError as error:
+            log.info("a task's turn has come and its record cannot be read", task=task, reason=str(error))
+            asyncio.get_running_loop().call_later(1.0, self._sweep.set)
+            return
+        finally:
+            del self._beginning[task]
+        if stored is None or stored.deleted or not self._plane.dht.owns(stored.key):
+            return
+        try:
+            record = read_record(stored.value)
+        except PayloadError as error:
+            log.warning("task record cannot be read", key=stored.key, reason=str(error))
+            return
+        if not record.state.final:
+            self.drive(record, stored.version, stored.value)
+
+    async def hurry(self, task: str) -> None:
+        """Take a task up that waits for its turn: there is an order for it."""
+        if (waiting := self.queue.remove(task)) is not None:
+            await self._begin(waiting)
+
+    def place(self, task: str) -> str:
+        """What a task waits for that waits for its turn, in words; "" for any other."""
+        if task not in self.queue:
+            return ""
+        ahead, most = self.queue.ahead(task), self._context.config.max_tasks
+        return (
+            f"its turn: {ahead:,} tasks of its submitter go before it, {len(self.queue):,} wait at "
+            f"{self._plane.gateway}, which works on {most} at once (tasks.max_tasks)"
+        )
+
+    async def _keep_turning(self) -> None:
+        while True:
+            await asyncio.sleep(TURN_S)
+            self._give_turns()
 
     def drive(self, record: TaskRecord, version: VersionVector, value: bytes = b"") -> None:
         """Drive a task from its record on, unless that is done; `value`: the record as it was stored."""
@@ -194,6 +314,7 @@ class Takeover:
                 pause_s = 0.0
             self._let_go.add(task)
             asyncio.get_running_loop().call_later(pause_s, self._sweep.set)
+        self._give_turns()
         self._changed()
 
     async def _keep_sweeping(self) -> None:
@@ -218,8 +339,15 @@ class Takeover:
         for task_id, driving in list(self._tasks.items()):
             if not self._plane.dht.owns(task_key(task_id)):
                 driving.cancel()
+        for task_id in self.queue:
+            if not self._plane.dht.owns(task_key(task_id)):
+                self.queue.remove(task_id)
         final: dict[str, VersionVector] = {}
-        for stored in await self._plane.dht.local(PREFIX, leave_out=TRIMMED):
+        for number, stored in enumerate(await self._plane.dht.local(PREFIX, leave_out=TRIMMED)):
+            if number % READ_AT_ONCE == READ_AT_ONCE - 1:
+                await asyncio.sleep(0)
+            if stored.key[len(PREFIX) :] in self.queue:  # read when its turn comes
+                continue
             if self._final.get(stored.key) == stored.version:  # the most by far
                 final[stored.key] = stored.version
                 continue
@@ -244,7 +372,7 @@ class Takeover:
                     self._step_down(coordinator)
                 self._heal_ended(record, stored.version, stored.value)
             elif record.id not in self._coordinators:
-                self.drive(record, stored.version, stored.value)
+                self.take(record, stored.version, stored.value)
             elif self._coordinators[record.id].copy_changed(stored.version):
                 self._step_down(self._coordinators[record.id])
         self._final = final
@@ -291,7 +419,9 @@ class Takeover:
         """Stop all coordinators; the records stay."""
         self._stopping = True
         self._unwatch()
-        tasks = [each for each in (self._sweeper, *self._tasks.values(), *self._healing.values()) if each]
+        await self._reading.close()
+        tasks = [*self._tasks.values(), *self._healing.values()]
+        tasks += [each for each in (self._sweeper, self._turning) if each is not None]
         for each in tasks:
             each.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -328,7 +458,7 @@ class TaskManager:
         self.plane = plane
         self._audit = audit or Audit(plane.session, plane.keys, plane.gateway)
         self._ages = Ages()
-        self._admission = Admission(plane.gateway, config.max_tasks)
+        self._admission = Admission(plane.gateway, config.max_tasks + config.max_queue)
         self._on_change = on_change
         self._on_record = on_record
         self._coordinators: dict[str, Coordinator] = {}
@@ -351,7 +481,13 @@ class TaskManager:
         )
         self._sweep = asyncio.Event()
         self.questions = Questions(
-            plane, self._coordinators, scheduler=self.scheduler, durations=self._ahead.durations, sweep=self._sweep
+            plane,
+            self._coordinators,
+            scheduler=self.scheduler,
+            durations=self._ahead.durations,
+            sweep=self._sweep,
+            hurry=self._hurry,
+            place=self._place,
         )
         self.context = Context(
             plane=plane,
@@ -378,6 +514,7 @@ class TaskManager:
             self._coordinators,
             sweep=self._sweep,
             ages=self._ages,
+            slow=self._admission.slow,
             moved=self._moved,
             ended=self._has_ended,
             changed=on_change,
@@ -386,8 +523,13 @@ class TaskManager:
 
     @property
     def unfinished(self) -> int:
-        """Tasks coordinated here that have not ended."""
-        return len(self._coordinators)
+        """Tasks of this coordinator that have not ended, those that wait for their turn among them."""
+        return self._takeover.at_work + len(self._takeover.queue)
+
+    @property
+    def waiting(self) -> int:
+        """Of these, those that wait for their turn."""
+        return len(self._takeover.queue)
 
     @property
     def findings(self) -> Mapping[str, int]:
@@ -397,8 +539,10 @@ class TaskManager:
     async def start(self) -> None:
         """Answer RPC and take up the unfinished tasks whose keys this gateway owns."""
         rpc = self.plane.rpc
-        rpc.register(keyspace.SUBMIT, self._audit.submission(self.submit))
-        rpc.register(keyspace.ACCEPT, self.accept)
+        # Before the audit: what is only told to come back is no order yet.
+        submit = self._audit.submission(self.submit)
+        rpc.register(keyspace.SUBMIT, self._admission.paced(submit, most=SUBMITTED_AT_ONCE))
+        rpc.register(keyspace.ACCEPT, self._admission.paced(self.accept, most=ACCEPTED_AT_ONCE))
         plans, questions = self.context.plans, self.questions
         rpc.register(keyspace.PLAN, plans.propose)
         rpc.register(keyspace.EXPERIENCE, plans.experience)
@@ -414,6 +558,7 @@ class TaskManager:
             self._coordinators,
             task=questions.task,
             drive=self._takeover.drive,
+            hurry=self._takeover.hurry,
             published=self.context.on_transition,
             audit=self._audit,
         ).register()
@@ -478,9 +623,9 @@ class TaskManager:
     async def accept(self, request: TaskRequest) -> TaskRecord:
         """Write the record, here and on the replicas, then drive it."""
         request = checked(request, self.config)
-        if request.id in self._coordinators:
+        if request.id in self._takeover:
             return await self.questions.task(TaskAsk(id=request.id))  # asked again, however full it is
-        with self._admission.one_more(request.id, self._coordinators):
+        with self._admission.one_more(request.id, self.unfinished):
             return await self._take(request)
 
     async def _take(self, request: TaskRequest) -> TaskRecord:
@@ -497,21 +642,32 @@ class TaskManager:
             within=request.group,
             plan=request.plan,
             approval=request.approval,
-            note=self.context.expect(request.plan, deadline_s=request.deadline_s),
+            note=self.context.expect(
+                request.plan, deadline_s=request.deadline_s, tasks_before=len(self._takeover.queue)
+            ),
         )
         record = machine.apply(None, transition)
         try:
             version = await self.plane.dht.write(task_key(record.id), encode(record), expected=None)
         except ConflictError:
             # Known already; perhaps by a first try whose answer was lost before it was driven.
-            self._sweep.set()
+            await self._take_known(request.id)
             return answered(await self.questions.task(TaskAsk(id=request.id)), request)
         self.plane.session.publish(keyspace.TRANSITION, transition, record.id)
         self.context.on_transition(transition)
         self.plane.session.publish(keyspace.TASK_UPDATE, record, record.id)
         log.info("task accepted", task=record.id, instruction=record.instruction)
-        self._takeover.drive(record, version)
+        self._takeover.take(record, version)
         return record
+
+    async def _take_known(self, task: str) -> None:
+        """Take up a task whose record is there, unless it has ended or is another gateway's."""
+        stored = await self.plane.dht.read(task_key(task))
+        if stored is None or stored.deleted or not self.plane.dht.owns(stored.key):
+            return
+        record = read_record(stored.value)
+        if not record.state.final:
+            self._takeover.take(record, stored.version, stored.value)
 
     # --- driving --------------------------------------------------------------------------------------------
 
@@ -557,6 +713,12 @@ class TaskManager:
 
     def _closed(self, subtask: Subtask) -> str:
         return self.context.plans.closed(subtask)
+
+    async def _hurry(self, task: str) -> None:
+        await self._takeover.hurry(task)
+
+    def _place(self, task: str) -> str:
+        return self._takeover.place(task)
 
     def _wake(self, task: str) -> None:
         """Have a task's coordinator look again: a subtask of it may go now."""

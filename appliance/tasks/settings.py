@@ -119,8 +119,12 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     backlog: Annotated[float, Meta(ge=0)] = 1.0
     """Runs that a coordinator lets be at a gateway beyond its containers, as a part of these: enough that none stands
     idle until its coordinator hears of it (70 ms), few enough that turns are taken here and not in its queue."""
-    max_tasks: int = 200
-    """Unfinished tasks one gateway coordinates; further submissions are refused with the reason."""
+    max_tasks: Annotated[int, Meta(ge=1)] = 200
+    """Tasks that one gateway works on at once as their coordinator; those beyond wait their turn. While they fill the
+    places, two of each other submitter are worked on beside them, up to twice as many in all."""
+    max_queue: Annotated[int, Meta(ge=0)] = 50_000
+    """Tasks that may wait for their turn at one coordinator, durable like all; further submissions are refused with the
+    reason and the time to come back. Each takes 1 kB of memory, and its record 2 kB of disk on three gateways."""
     max_instruction_chars: int = 2000
     """Longer instructions are refused: no plain instruction is, and prompts must stay bounded."""
     run_timeout_s: float = 3.0

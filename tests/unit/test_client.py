@@ -1,5 +1,6 @@
 """The client of a fleet: whom it asks, and whom next."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,6 +21,8 @@ class Wire:
         self.silent = silent
         self.gone = gone
         self.asked: list[tuple[str, str]] = []
+
+        self.ring = SimpleNamespace(owner=lambda _: "gw-1")
 
     def members(self) -> frozenset[str]:
         """Who is there."""

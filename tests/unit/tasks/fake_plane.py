@@ -103,7 +103,7 @@ class FakeDht:
         self.writes = 0
         self.watchers: list[tuple[Callable[[str], bool], Callable[[Record], None]]] = []
 
-    async def read(self, key: str) -> Record | None:
+    async def read(self, key: str, *, replica: bool = False) -> Record | None:
         """Return a record."""
         await asyncio.sleep(0)
         return self.records.get(key)

@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import time
 from typing import Any
 
 import pytest
@@ -9,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from appliance.model import Group, Plan, RunEventKind, Subtask, TaskRecord, TaskState, encode
+from appliance.errors import RefusedError
+from appliance.model import Group, Plan, RunEventKind, Subtask, TaskRecord, TaskRequest, TaskState, encode
 from appliance.plane.session import Message
-from appliance.tasks.admission import LONGEST_RETRY_S, Ends, expectation, full, longest_s
+from appliance.tasks.admission import LONGEST_PAUSE_S, LONGEST_RETRY_S, Admission, Ends, expectation, full, longest_s
 from appliance.tasks.machine import TransitionKind
 from appliance.tasks.timing import Ages, left_s
 
@@ -134,3 +136,43 @@ async def test_without_room_a_subtask_waits_with_a_note_and_uses_up_no_attempt(b
     assert waiting.note == "3 subtasks wait for room before it"
     bench.context.room = True
     assert (await bench.ordered())[1].attempt == 1
+
+
+async def test_submissions_under_way_at_once_are_bounded_and_others_are_told_when_to_return() -> None:
+    """The bound holds whatever comes; when one has ended the next is let in."""
+    admission, going = Admission("gw-1", 100), asyncio.Event()
+
+    async def take(request: TaskRequest) -> TaskRecord:
+        await going.wait()
+        return TaskRecord(id=request.id, instruction="x")
+
+    submit = admission.paced(take, most=3)
+    works = [asyncio.create_task(submit(TaskRequest(instruction="x", id=f"t-{each}"))) for each in range(5)]
+    await asyncio.sleep(0)
+    going.set()
+    answers = await asyncio.gather(*works, return_exceptions=True)
+    refused = [each for each in answers if isinstance(each, RefusedError)]
+    assert len(refused) == 2
+    assert all(0 < each.retry_after_s <= LONGEST_PAUSE_S for each in refused)
+    assert (await submit(TaskRequest(instruction="x", id="t-9"))).id == "t-9"
+
+
+def test_acceptances_are_slow_by_what_they_take_and_only_while_some_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine on which each takes long is not slow for that; what was slow a while ago does not count."""
+    now = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+
+    def took(seconds: float, times: int, admission: Admission) -> None:
+        nonlocal now
+        for number in range(times):
+            with admission.one_more(f"t-{number}", 0):
+                now += seconds
+
+    quick, steady = Admission("gw-1", 100), Admission("gw-1", 100)
+    took(0.008, 20, quick)
+    assert not quick.slow(now)
+    took(0.2, 20, quick)
+    assert quick.slow(now)
+    assert not quick.slow(now + 10.0)
+    took(0.2, 100, steady)
+    assert not steady.slow(now)

@@ -239,18 +239,96 @@ async def test_fields_of_a_later_version_stay_in_the_record(manager: TaskManager
     assert msgspec.json.decode(plane.dht.records["task/t-1"].value)["colour"] == {"of": "later"}
 
 
+@pytest.fixture
+async def small(plane: Any, tasks_config: Any, catalogue: Any) -> AsyncIterator[TaskManager]:
+    """Return a started manager that works on two tasks at once, with room for six more."""
+    plane.rpc.on["run"] = never
+    made = TaskManager(
+        replace(tasks_config, max_tasks=2, max_queue=6),
+        plane=plane,
+        catalogue=catalogue,
+        decomposer=cast("Any", AgreeableDecomposer()),
+        site=Site(),
+    )
+    await made.start()
+    yield made
+    await made.stop()
+
+
 async def test_a_flood_of_tasks_does_not_get_past_the_bound_while_records_are_written(
-    manager: TaskManager, plane: Any
+    small: TaskManager, plane: Any
 ) -> None:
     """Those that are only being written count as well; a second request for a task that was taken gets that task."""
-    most = manager.config.max_tasks
-    wishes = [manager.submit(wish(plane, f"t-{number}")) for number in range(most + 20)]
+    wishes = [small.accept(wish(plane, f"t-{number}")) for number in range(12)]
     answers = await asyncio.gather(*wishes, return_exceptions=True)
-    assert sum(isinstance(each, RefusedError) for each in answers) == 20
-    assert manager.unfinished == most
-    assert (await manager.submit(wish(plane, "t-0"))).id == "t-0"
-    with pytest.raises(RefusedError, match=str(most)):
-        await manager.submit(wish(plane, "t-new"))
+    assert sum(isinstance(each, RefusedError) for each in answers) == 4
+    assert (small.unfinished, small.waiting) == (8, 6)
+    assert (await small.submit(wish(plane, "t-7"))).id == "t-7"
+    with pytest.raises(RefusedError, match="8 unfinished"):
+        await small.submit(wish(plane, "t-new"))
+
+
+async def test_tasks_beyond_the_places_wait_and_are_taken_up_when_one_ends(small: TaskManager, plane: Any) -> None:
+    """They are durable as accepted, say what they wait for, and have their turn in the order of acceptance."""
+    for number in range(4):
+        await small.submit(wish(plane, f"t-{number}"))
+    assert small.coordinator("t-2") is None
+    found = await small.questions.why(WhyAsk(id="t-3"))
+    assert (found.state, found.waits.partition(" go")[0]) == ("accepted", "its turn: 1 tasks of its submitter")
+    await small.questions.cancel(CancelTaskAsk(id="t-0"))
+    await until(lambda: small.coordinator("t-2") is not None)
+    assert small.coordinator("t-3") is None
+    assert (small.unfinished, small.waiting) == (3, 1)
+
+
+async def test_the_task_of_another_submitter_does_not_wait_for_a_flood(small: TaskManager, plane: Any) -> None:
+    """The places are full of one submitter's: another's goes at once, and so does an order of higher priority."""
+    for number in range(5):
+        await small.submit(wish(plane, f"t-{number}"))
+    await small.submit(replace(wish(plane, "t-ann"), submitter="ann"))
+    await until(lambda: small.coordinator("t-ann") is not None)
+    await small.submit(replace(wish(plane, "t-now"), priority=9))
+    await until(lambda: small.coordinator("t-now") is not None)
+    assert small.waiting == 3
+
+
+async def test_a_waiting_task_is_cancelled_at_once(small: TaskManager, plane: Any) -> None:
+    """It need not have its turn first, and what was said stands in its record."""
+    for number in range(5):
+        await small.submit(wish(plane, f"t-{number}"))
+    record = await small.questions.cancel(CancelTaskAsk(id="t-4", by="ann", why="not needed"))
+    assert record.state is TaskState.CANCELLED
+    assert record.cancelled_by is not None
+    assert record.cancelled_by.why == "not needed"
+    assert small.waiting == 2
+
+
+async def test_a_waiting_task_ends_when_its_deadline_passes(small: TaskManager, plane: Any) -> None:
+    """It fails with the code that says so, although its turn never came."""
+    for number in range(2):
+        await small.submit(wish(plane, f"t-{number}"))
+    await small.submit(replace(wish(plane, "t-late"), deadline_s=0.2))
+    assert small.waiting == 1
+    async with asyncio.timeout(60):
+        while not (record := await small.questions.task(TaskAsk(id="t-late"))).state.final:
+            await asyncio.sleep(0.02)
+    assert record.failure is not None
+    assert record.failure.code == "deadline"
+
+
+async def test_waiting_tasks_of_the_shard_are_taken_over_and_let_go(small: TaskManager, plane: Any) -> None:
+    """A gateway that becomes their owner finds all; one that is not any more keeps none; records stay as they are."""
+    for number in range(6):
+        record = replace(plane.accepted(plan=plane.plan_of()), id=f"t-{number}", created_ns=number)
+        await plane.dht.write(f"task/t-{number}", encode(record), expected=None)
+    small._sweep.set()
+    await until(lambda: small.unfinished == 6)
+    assert small.waiting == 4
+    assert small.coordinator("t-0") is not None
+    plane.dht.mine = False
+    small._sweep.set()
+    await until(lambda: small.unfinished == 0)
+    assert len(plane.dht.records) == 6
 
 
 async def test_forged_run_events_are_counted_and_dropped(manager: TaskManager, plane: Any) -> None:

@@ -78,6 +78,24 @@ def throughput(
     return 0
 
 
+@bench_app.command(name="tasks")
+def bench_tasks(*, tasks: int = 3000, gateways: int = 3, containers: int = 2, as_json: Json = False) -> int:
+    """Thousands of tasks of one sender: how fast they are accepted, and what orders and reads find meanwhile.
+
+    Exit code 1 when a target is missed; they hold for two cores with nothing else on them.
+
+    Args:
+        tasks: Tasks handed in; 10000 shows the memory they take.
+        gateways: Gateways, each a process.
+        containers: Containers each keeps ready.
+    """
+    from workshop.bench.flood import Options, run
+
+    found = measure(run(Options(tasks=tasks, gateways=gateways, containers=containers), progress=say))
+    tell(found, as_json=as_json)
+    return Exit.DONE if all(each["kept"] for each in found["targets"].values()) else Exit.FAILED
+
+
 @bench_app.command
 def intent(
     *,
