@@ -82,7 +82,7 @@ def submit(
     if (file is None) == (not text) or (file is not None and wait):
         raise ConfigError(
             "--wait is for a single instruction" if text or wait else "there is no instruction",
-            remedy="give an instruction, or --file without --wait",
+            remedy="give TEXT, or --file without --wait",
         )
     if priority is None:
         priority = PLAIN_PRIORITY if file is None else PLAIN_PRIORITY - 1

@@ -103,7 +103,7 @@ def test_what_does_not_go_together_is_refused(
 ) -> None:
     """Neither text nor file, both, or waiting for a file's tasks."""
     assert run(*words) == 2
-    assert "give an instruction, or --file" in capsys.readouterr().err
+    assert "give TEXT, or --file" in capsys.readouterr().err
     assert not fleet.taken
 
 
