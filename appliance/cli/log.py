@@ -123,6 +123,7 @@ def log_cat(
     without: Without = (),
     grep: Annotated[str, Parameter(help="Only messages whose text matches this regular expression.")] = "",
     limit: Annotated[int, Parameter(help="How many at most; 0: all.")] = 0,
+    task: Annotated[str, Parameter(help="Only what is about this task: its record, transitions and runs.")] = "",
     as_json: Json = False,
 ) -> int:
     """Print a log's messages, a line each: time, key, payload; --json prints JSON lines.
@@ -132,6 +133,8 @@ def log_cat(
     """
     from appliance.record.edit import cat
 
+    if task:
+        keys = (*keys, f"swiftbot/*/task/{task}/**")
     select = _select(paths, keys, without, since, until)
     try:
         damaged = cat(paths, select, grep=grep, limit=limit, as_json=as_json, write=sys.stdout.write)
@@ -143,6 +146,24 @@ def log_cat(
     for problem in damaged:
         console.err.print(f"! {problem}", markup=False)
     return Exit.FAILED if damaged else Exit.DONE
+
+
+@log_app.command(name="layout")
+def log_layout(
+    *,
+    recorder: Annotated[
+        str, Parameter(help="Recorder that writes the log; `live` for `swiftbot foxglove`.")
+    ] = "recorder",
+    where: Where = HERE,
+) -> int:
+    """Print a layout for Foxglove as JSON: robots in 3D and on the map, log, the task and robot of its variables.
+
+    Write it to a file and choose "Import from file" among Foxglove's layouts.
+    """
+    from appliance.record.layout import layout
+
+    show(layout(where.fleet, recorder), as_json=True)
+    return Exit.DONE
 
 
 @log_app.command(name="pin")

@@ -82,6 +82,8 @@ class Topic(Template, Generic[P]):
         payload: what is put there, as JSON; `Untyped` of bytes, and of JSON of many forms.
         shown: the payload for docs/keyspace.md; empty: the payload's name.
         form: `put`, `query` (asked there), `token` (liveliness), `log` (only written into logs).
+        inside: fields of the payload that say what stands in the template's braces, in their order: in logs all keys
+            of the topic share one channel (`record.channels`). For what comes and goes; none: each key has its own.
         writer: who may put there or answers there.
         often: how often.
         kept: by whom it is kept.
@@ -98,6 +100,7 @@ class Topic(Template, Generic[P]):
         shown: str = "",
         *,
         form: str = "put",
+        inside: tuple[str, ...] = (),
         writer: str,
         often: str = "–",
         kept: str = "–",
@@ -108,7 +111,7 @@ class Topic(Template, Generic[P]):
     ) -> None:
         super().__init__(text)
         self.puts, self.reads, self.answers, self.asks = puts, reads, answers, asks
-        self.payload, self.form = payload, form
+        self.payload, self.form, self.inside = payload, form, inside
         self.shown = shown or ("–" if issubclass(payload, Untyped) else payload.__name__)
         self.writer, self.often, self.kept = writer, often, kept
         self.kind = "/".join("*" if chunk.startswith("{") else chunk for chunk in text.split("/"))

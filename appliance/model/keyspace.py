@@ -97,6 +97,10 @@ CONTAINER = Topic(
     "gw/{gateway}/pool/{container}",
     ContainerInfo,
     form="put, delete",
+    inside=(
+        "gateway",
+        "id",
+    ),
     writer="that gateway",
     often="on change (coalesced 20 ms)",
     kept="until deleted, `dead`, or the gateway goes",
@@ -116,6 +120,10 @@ EXCHANGE = Topic(
     "gw/{gateway}/exchange/{verb}",
     plane_api.Exchange,
     "Exchange (below)",
+    inside=(
+        "gateway",
+        "verb",
+    ),
     writer="the gateway that answered",
     often="after each answer",
     kept="in logs only",
@@ -135,6 +143,10 @@ CHUNK = Topic(
 TRANSFER = Topic(
     "gw/{gateway}/transfer/{transfer}",
     transfer_api.Progress,
+    inside=(
+        "gateway",
+        "id",
+    ),
     writer="the gateway where it arrives",
     often="twice a second while it moves, once at its end",
     kept="in logs only",
@@ -206,6 +218,7 @@ BACKLOG = Topic(
 TASK_UPDATE = Topic(
     "task/{task}/record",
     TaskRecord,
+    inside=("id",),
     writer="the task's coordinator",
     often="on change",
     kept="the record itself is in the DHT; this is the news of it",
@@ -215,6 +228,7 @@ TASK_UPDATE = Topic(
 TRANSITION = Topic(
     "task/{task}/transition",
     Transition,
+    inside=("task",),
     writer="the task's coordinator",
     often="every input of the state machine, in order",
     kept="in logs, for replay",
@@ -224,6 +238,10 @@ TRANSITION = Topic(
 RUN_EVENT = Topic(
     "task/{task}/run/{subtask}",
     RunEvent,
+    inside=(
+        "task",
+        "subtask",
+    ),
     writer="the executing gateway",
     often="started, progress, log, partial, checkpoint (without its data), alive, end; each but `alive` numbered per "
     "run",
@@ -279,6 +297,7 @@ ROBOT_ALIVE = Topic(
 ROBOT = Topic(
     "robot/{robot}/state",
     RobotInfo,
+    inside=("id",),
     writer="as above",
     often="a few times a second",
     kept="by each listener; offline after its token goes, forgotten 5 min later",
@@ -341,6 +360,7 @@ INTAKE = Topic(
 NOTICE = Topic(
     "notice/{to}",
     Notice,
+    inside=("to",),
     writer="a gateway",
     often="by `notify`, and of its own accord; what both sides of a partition give has the same `id`, and is shown "
     "once",
@@ -362,6 +382,7 @@ STOP = Topic(
     "operator/stop/{act}",
     SoftStop,
     "SoftStop `{id, robots, by, why, at_ns}`; no robots: the fleet",
+    inside=("id",),
     writer="the operator's tool, then the gateway that keeps it",
     often="per soft stop",
     kept="by every gateway, on disk, until lifted and forgotten",
@@ -372,6 +393,7 @@ LIFTED = Topic(
     "operator/resume/{act}",
     Lifted,
     "Lifted `{id, stops, robots, by, why, at_ns}`",
+    inside=("id",),
     writer="the gateway that keeps it",
     often="when stops are lifted",
     kept="as above",
@@ -382,6 +404,7 @@ LEASE = Topic(
     "operator/lease/{robot}",
     Lease,
     "Lease `{id, robot, by, why, lease_s, renewal, ended}`",
+    inside=("robot",),
     writer="the gateway that was asked; at the end the one that saw it",
     often="when an operator takes a robot over, at each renewal, at the end",
     kept="by each gateway until it ends",
@@ -392,6 +415,7 @@ ENQUIRY = Topic(
     "operator/ask/{enquiry}",
     Enquiry,
     "Enquiry `{id, question, choices, to, robot, task, subtask, expires_s, answer, by}`",
+    inside=("id",),
     writer="the gateway where it is asked, or answered",
     often="when a skill or robot asks people something, and when that is answered",
     kept="the question itself is in the DHT",
@@ -403,6 +427,7 @@ ALERT = Topic(
     alerts.Alert,
     "Alert `{id, kind, level, what, subject, name, remedy, since_ns, until_ns, acked, cleared_ns}`; with `cleared_ns` "
     "it is over",
+    inside=("id",),
     writer="the gateway that looks after it, or where it is acknowledged",
     often="when it begins, changes (at most every 10 s), is acknowledged, is over",
     kept="the alert itself is in the DHT",
@@ -470,9 +495,9 @@ RECORDER_LOG = Topic(
     kept="only written into logs",
 )
 RECORDER_VIEW = Topic(
-    "recorder/{recorder}/robot/{robot}/{what}",
+    "recorder/{recorder}/robots/{what}",
     Untyped,
-    "`pose`, `transform`, `location`: foxglove.PoseInFrame, FrameTransform, LocationFix, made of the robot's state",
+    "`transform`, `location`: foxglove.FrameTransform, LocationFix, made of the states of all robots",
     form="log",
     writer="a recorder",
     kept="only written into logs",
@@ -1338,6 +1363,8 @@ LEARN_RECORD = RecordKind(
 
 VERBS = tuple(cast("Verb[Any, Any]", value) for value in tuple(globals().values()) if isinstance(value, Verb))
 TOPICS = tuple(cast("Topic[Any]", value) for value in tuple(globals().values()) if isinstance(value, Topic))
+TELEMETRY: tuple[Topic[Any], ...] = (MAVLINK, LINK_FRAMES, CAMERA, ROBOT)
+"""What is said so often that the next one says it again: of these a recorder that is overloaded keeps a part."""
 RECORD_KINDS = tuple(value for value in tuple(globals().values()) if isinstance(value, RecordKind))
 
 
@@ -1350,3 +1377,9 @@ def record_kind(key: str) -> RecordKind | None:
 def topic_of(key: str) -> Topic[Any] | None:
     """Return the topic that a whole key of any fleet is of; None where it is of none."""
     return next((topic for topic in TOPICS if topic.match(key) is not None), None)
+
+
+@lru_cache(8192)
+def is_telemetry(key: str) -> bool:
+    """Whether a whole key is of telemetry."""
+    return any(topic.match(key) is not None for topic in TELEMETRY)

@@ -160,6 +160,10 @@ class Inbox:
             self._waiting.clear()
 
 
+TELEMETRY_PART = 0.75
+"""Of a queue that telemetry may fill: the rest is for orders, tasks, stops and all else that comes seldom."""
+
+
 class Outbox:
     """Sends in order on a thread of its own, so that a stuck peer holds up that thread and never the loop."""
 
@@ -176,10 +180,10 @@ class Outbox:
         self._thread = threading.Thread(target=self._run, name="zenoh sender", daemon=True)
         self._thread.start()
 
-    def send(self, call: Callable[[], None], size: int) -> bool:
-        """Queue a send; False when it was dropped because the queue is full."""
+    def send(self, call: Callable[[], None], size: int, *, part: float = 1.0) -> bool:
+        """Queue a send; False when it was dropped because the queue is full, or as full as `part` of it."""
         with self._some:
-            if self._closed or len(self._waiting) >= self._most or self._bytes + size > self._most_bytes:
+            if self._closed or len(self._waiting) >= part * self._most or self._bytes + size > part * self._most_bytes:
                 self.dropped += 1
                 return False
             self._waiting.append((call, size))
@@ -396,14 +400,17 @@ class Wire:
             declared.undeclare = declared.make(raw)
         self.reopening = False
 
-    def send(self, key: str, send: Callable[[], None], size: int, *, bulk: bool = False) -> bool:
-        """Have the sender's thread send; False when it does not fit into its queue, which is counted."""
+    def send(self, key: str, send: Callable[[], None], size: int, *, bulk: bool = False, part: float = 1.0) -> bool:
+        """Have the sender's thread send; False when it does not fit into its queue, which is counted.
+
+        `part`: of the queue that it may fill.
+        """
         outbox = self.outbox
         if bulk:
             outbox = self._bulk = self._bulk or self._new_outbox()
-        queued = outbox.send(partial(link.quietly, send, key), size)
+        queued = outbox.send(partial(link.quietly, send, key), size, part=part)
         if not queued and not self.closed:
-            self.refuse("outgoing queue full", key=key)
+            self.refuse("outgoing queue full" if part == 1.0 else "outgoing telemetry thinned", key=key)
         return queued
 
     def refuse(self, what: str, *, count: int = 1, **fields: Any) -> None:
@@ -650,7 +657,8 @@ class Publisher:
         if len(payload) > self._wire.config.max_payload_bytes:
             self._wire.refuse("oversize put", key=self._key, size=len(payload))
         else:
-            self._publishing.queue(self._key, partial(self._say, payload), len(payload))
+            # What comes so often leaves a part of the queue to what does not: it is thinned before an order is lost.
+            self._publishing.queue(self._key, partial(self._say, payload), len(payload), part=TELEMETRY_PART)
 
     def _say(self, payload: bytes) -> None:
         stamp, source = self._publishing.number(self._key, payload, self._encoding)
@@ -710,9 +718,9 @@ class Publishing:
     def _send(self, key: str, payload: bytes | None, *, encoding: str = "", express: bool = False) -> None:
         self.queue(key, partial(self._say, key, payload, encoding, express), len(payload or b""))
 
-    def queue(self, key: str, say: Callable[[], None], size: int) -> None:
-        """Have a put or delete of a key made on the sender's thread."""
-        if not self._wire.send(key, say, size) and self._is_recorded(key):
+    def queue(self, key: str, say: Callable[[], None], size: int, *, part: float = 1.0) -> None:
+        """Have a put or delete of a key made on the sender's thread; `part` of its queue that this may fill."""
+        if not self._wire.send(key, say, size, part=part) and self._is_recorded(key):
             self._wire.backlog.not_sent(key)
 
     def _is_recorded(self, key: str) -> bool:

@@ -1,6 +1,6 @@
 """MCAP: recorder, rotation, recovery, reading back.
 
-Doors: `settings.RecordConfig`; `recorder.run_recorder` (a process of its own, `swiftbot record`) with
+Doors: `layout.layout`, `settings.RecordConfig`; `recorder.run_recorder` (a process of its own, `swiftbot record`) with
 `segments.about`; `foxglove_bridge.serve` with `foxglove_bridge.LiveOptions` for the live view; `reader.info`,
 `reader.read`, `edit`, `player` and `retention.pin` for files; `remote_control` for commands to recorders and players;
 `segments.VERSION` of the program,

@@ -19,6 +19,7 @@ from appliance.errors import ConfigError, PrerequisiteError
 from appliance.model import keyspace
 from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
+from appliance.record.channels import shared_for
 from appliance.record.models import LoggedMessage, check_expression, compile_expression
 from appliance.record.redact import Redactor
 from appliance.record.schemas import ChannelKind, Derive, Foxglove, KeySchemas
@@ -31,7 +32,7 @@ PORT = 8765
 NAME = "live"
 """In the place of a recorder's name, in the keys of derived messages."""
 MOST_CHANNELS = 10_000
-"""Beyond, the channel that was silent for longest is closed: each task has some of its own. Keys that nobody wants
+"""Beyond, the channel that was silent for longest is closed. Keys that nobody wants
 count as well."""
 BACKLOG = 1024
 """Messages that wait for one client; the oldest are dropped."""
@@ -142,12 +143,15 @@ class LiveView:
     def _show(self, message: LoggedMessage) -> None:
         if message.deleted:
             return
-        which = (message.key, message.encoding)
+        shared = shared_for(message.key, message.payload) if message.encoding == JSON else None
+        if shared is not None and not self._is_wanted(message.key):
+            return
+        which = (message.key if shared is None else shared.topic, message.encoding)
         if which in self._channels:
             channel = self._channels[which]
             self._channels.move_to_end(which)
         else:
-            channel = self._open(which)
+            channel = self._open(which, message.key)
         if channel is None:
             return
         at_ns = message.at_ns if 0 < message.at_ns <= LAST_NS else time.time_ns()
@@ -164,13 +168,15 @@ class LiveView:
                 self._channels.move_to_end(topic)
                 other.base.log(made.payload, log_time=at_ns)
 
-    def _open(self, which: tuple[str, str]) -> _Channel | None:
-        key, encoding = which
-        if self._wanted and not any(each.fullmatch(key) for each in self._wanted):
+    def _is_wanted(self, key: str) -> bool:
+        return not self._wanted or any(each.fullmatch(key) for each in self._wanted)
+
+    def _open(self, which: tuple[str, str], key: str) -> _Channel | None:
+        if not self._is_wanted(key):
             self._make_room()
             self._channels[which] = None
             return None
-        return self._made(which, self._schemas.kind_of(key, encoding), self._views.deriving(key))
+        return self._made(which, self._schemas.kind_of(key, which[1]), self._views.deriving(key))
 
     def _make_room(self) -> None:
         while len(self._channels) >= MOST_CHANNELS:

@@ -33,6 +33,7 @@ from mcap.summary import Summary
 from appliance.errors import NotFoundError, RecordError
 from appliance.model.recorder_api import Deletion, Gap, Incident
 from appliance.plane.backlog import UNKNOWN, kind_of
+from appliance.record.channels import shared_of
 from appliance.record.models import ChannelInfo, LoggedMessage, LogInfo, compile_expression
 from appliance.record.segments import METADATA, VEHICLE
 
@@ -298,7 +299,9 @@ def read(
     for record in stream:
         if isinstance(record, Channel):
             taken[record.id] = record.metadata.get("derived") != "true" and (
-                want(record.topic) or _DELETIONS.fullmatch(record.topic) is not None
+                want(record.topic)
+                or _DELETIONS.fullmatch(record.topic) is not None
+                or shared_of(record.topic, record.metadata) is not None
             )
         elif isinstance(record, Message) and taken[record.channel_id]:
             channel = stream.channels[record.channel_id]
@@ -317,7 +320,7 @@ def read(
 
 
 def logged(channel: Channel, message: Message) -> LoggedMessage:
-    """Return a record as the message it stands for: a deletion as the deletion of its key."""
+    """Return a record as the message it stands for: under its key, a deletion as the deletion of its key."""
     if _DELETIONS.fullmatch(channel.topic):
         try:
             deletion = msgspec.json.decode(message.data, type=Deletion)
@@ -326,7 +329,9 @@ def logged(channel: Channel, message: Message) -> LoggedMessage:
         else:
             return LoggedMessage(deletion.key, message.log_time, b"", "", deleted=True)
     encoding = channel.metadata.get("encoding", channel.message_encoding)
-    return LoggedMessage(channel.topic, message.log_time, message.data, encoding)
+    shared = shared_of(channel.topic, channel.metadata)
+    key = shared.key_of(message.data) if shared is not None else None
+    return LoggedMessage(key or channel.topic, message.log_time, message.data, encoding)
 
 
 class _Account:

@@ -291,13 +291,26 @@ class Drop(Struct, frozen=True):
         )
 
 
+THINNED = "thinned"
+"""Reason of a gap in telemetry that made room for everything else."""
+_THIN_FROM, _THIN_TO, _ONE_IN = 0.75, 0.875, 4
+"""From so full on one in four messages of each telemetry key is kept; from there on none."""
+
+
 class Intake:
     """Messages between the event loop and the writer thread, bounded by number and by bytes.
 
-    `put` never waits; a message that does not fit is counted and handed over by the next `take`.
+    `put` never waits; a message that does not fit is counted and handed over by the next `take`. Telemetry is thinned
+    before anything else is lost: when three quarters are full, of each of its keys one message in four is kept, and the
+    last eighth is not for it at all. `thins` says of a key whether it is telemetry.
     """
 
-    def __init__(self, *, messages: int, payload_bytes: int) -> None:
+    def __init__(
+        self, *, messages: int, payload_bytes: int, thins: Callable[[str], bool] = keyspace.is_telemetry
+    ) -> None:
+        self._thins = thins
+        self._came: dict[str, int] = {}
+        """Telemetry key -> its messages since it began to be thinned."""
         self._most, self._most_bytes = messages, payload_bytes
         self._lock = threading.Lock()
         self._some = threading.Event()
@@ -309,24 +322,29 @@ class Intake:
 
     def put(self, message: LoggedMessage) -> bool:
         """Add a message; False when it was dropped."""
-        size = len(message.payload)
+        size, reason = len(message.payload), ""
         with self._lock:
-            full = not self._fits(1, size)
-            if not full:
+            if not self._fits(1, size, _THIN_FROM) and self._thins(message.key):
+                came = self._came[message.key] = self._came.get(message.key, -1) + 1
+                reason = "" if came % _ONE_IN == 0 and self._fits(1, size, _THIN_TO) else THINNED
+            elif not self._fits(1, size):
+                reason = "queue full"
+            if not reason:
                 self._waiting.append(message)
                 self._bytes += size
-        if full:
-            self.lose("queue full", Drop.of(message))
+        if reason:
+            self.lose(reason, Drop.of(message))
         self._some.set()
-        return not full
+        return not reason
 
     def put_all(self, messages: list[LoggedMessage]) -> None:
         """Add messages in order. A burst waits a moment for room; what does not fit then is dropped and counted."""
         size = sum(len(each.payload) for each in messages)
         self._make_way(len(messages), size)
         with self._lock:
-            fits = self._fits(len(messages), size)
+            fits = self._fits(len(messages), size, _THIN_FROM)
             if fits:
+                self._came.clear()
                 self._waiting += messages
                 self._bytes += size
         if fits:
@@ -335,14 +353,14 @@ class Intake:
             for each in messages:
                 self.put(each)
 
-    def _fits(self, messages: int, size: int) -> bool:
-        """Whether there is room for so many, of so many bytes together; under the lock."""
-        return len(self._waiting) + messages <= self._most and self._bytes + size <= self._most_bytes
+    def _fits(self, messages: int, size: int, part: float = 1.0) -> bool:
+        """Whether there is room for so many, of so many bytes together, in a part of the queue; under the lock."""
+        return len(self._waiting) + messages <= part * self._most and self._bytes + size <= part * self._most_bytes
 
     def _make_way(self, messages: int, size: int) -> None:
         """Wait until the writer has taken what is there, unless it does not come round: then nothing waits for it."""
         with self._lock:
-            if self._stuck or not self._waiting or self._fits(messages, size):
+            if self._stuck or not self._waiting or self._fits(messages, size, _THIN_FROM):
                 return
             self._room.clear()
         if not self._room.wait(PATIENCE_S):

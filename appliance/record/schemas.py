@@ -5,20 +5,19 @@ Foxglove wants a JSON schema whose root is an object and which has no unions; ms
 MAVLink frames with the message encoding `mavlink`, everything else under its Zenoh encoding.
 
 The originals stay as they were put. `Foxglove` derives further messages from them, on channels of the recorder's own,
-so that Foxglove's panels show them as they are: poses and frame transforms for the 3D panel, locations for the map,
-lines for the log panel. Field names and units are those of docs.foxglove.dev, "Message schemas", in their JSON form.
-Pure functions.
+so that Foxglove's panels show them as they are: frame transforms for the 3D panel, locations for the map, lines for the
+log panel; those of all robots on one channel each, as panels expect it. Field names and units are those of
+docs.foxglove.dev, "Message schemas", in their JSON form. Pure functions.
 """
 
 import math
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any, cast
 
 import msgspec
 from msgspec import Struct
 
-from appliance.errors import PayloadError
 from appliance.model import LogLine, Notice, RobotInfo, Site, keyspace
 from appliance.model.keys import Keys, Untyped
 from appliance.model.site import to_globe
@@ -49,7 +48,6 @@ _WHOLE: JsonSchema = {"type": "integer", "minimum": 0}
 _TIME = _object("time", "Seconds and nanoseconds since the epoch", sec=_WHOLE, nsec=_WHOLE)
 _VECTOR = _object("foxglove.Vector3", "A vector in 3D space", x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _QUATERNION = _object("foxglove.Quaternion", "A rotation in 3D space", x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE = _object("foxglove.Pose", "A position and orientation in 3D space", position=_VECTOR, orientation=_QUATERNION)
 
 COMPRESSED_IMAGE = _object(
     "foxglove.CompressedImage",
@@ -69,9 +67,6 @@ FOXGLOVE_LOG = _object(
     file=_STRING,
     line={"type": "integer", "minimum": 0},
 )
-POSE_IN_FRAME = _object(
-    "foxglove.PoseInFrame", "A timestamped pose", timestamp=_TIME, frame_id=_STRING, pose=_POSE
-)  # fmt: skip
 FRAME_TRANSFORM = _object(
     "foxglove.FrameTransform",
     "A transform between two frames",
@@ -100,7 +95,6 @@ def _kind(schema: JsonSchema) -> ChannelKind:
 
 IMAGE_KIND = _kind(COMPRESSED_IMAGE)
 LOG_KIND = _kind(FOXGLOVE_LOG)
-POSE_KIND = _kind(POSE_IN_FRAME)
 TRANSFORM_KIND = _kind(FRAME_TRANSFORM)
 LOCATION_KIND = _kind(LOCATION_FIX)
 
@@ -140,21 +134,6 @@ class FoxgloveLog(Struct, frozen=True):
     name: str
     file: str = ""
     line: int = 0
-
-
-class PlacedPose(Struct, frozen=True):
-    """`foxglove.Pose`."""
-
-    position: Vector
-    orientation: Quaternion
-
-
-class PoseInFrame(Struct, frozen=True):
-    """`foxglove.PoseInFrame`."""
-
-    timestamp: Time
-    frame_id: str
-    pose: PlacedPose
 
 
 class FrameTransform(Struct, frozen=True):
@@ -215,8 +194,7 @@ class Foxglove:
         self._keys = keys
         self._recorder = recorder
         self._site = site
-        self._topics_of = lru_cache(maxsize=1024)(self._topics)
-        """A robot says where it is ten times a second: its channels' names are made once."""
+        self._topics = {what: keys(keyspace.RECORDER_VIEW, recorder, what) for what in _OF_VIEW}
         self._makers: tuple[tuple[Any, Derive], ...] = (
             (compile_expression(keys(keyspace.LOG)), self._of_line),
             (compile_expression(keys(keyspace.NOTICE)), self._of_notice),
@@ -248,31 +226,25 @@ class Foxglove:
         made = FoxgloveLog(time_of(at_ns), level, text, name)
         return (Derived(self._keys(keyspace.RECORDER_LOG, self._recorder), LOG_KIND, msgspec.json.encode(made)),)
 
-    def _topics(self, robot: str) -> dict[str, str]:
-        """Names of a robot's channels by what they show; PayloadError for a name that cannot be in a key."""
-        return {what: self._keys(keyspace.RECORDER_VIEW, self._recorder, robot, what) for what in _OF_VIEW}
-
     def _of_robot(self, message: LoggedMessage) -> tuple[Derived, ...]:
         # By the key, not by what the payload says of itself: one who lies about its id moves nobody else.
         (name,) = keyspace.ROBOT.names(message.key)
         try:
             robot = msgspec.json.decode(message.payload, type=RobotInfo)
-            topics = self._topics_of(name)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, PayloadError):
-            return ()  # the last: a stranger's put under a name that cannot be in a key of ours
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            return ()
         pose = robot.pose
         if pose is None or not all(map(math.isfinite, (pose.x, pose.y, pose.z, pose.heading_deg))):
             return ()
         at, position, rotation = time_of(message.at_ns), Vector(pose.x, pose.y, pose.z), facing(pose.heading_deg)
         made: list[tuple[str, ChannelKind, Struct]] = [
-            ("pose", POSE_KIND, PoseInFrame(at, SITE_FRAME, PlacedPose(position, rotation))),
             ("transform", TRANSFORM_KIND, FrameTransform(at, SITE_FRAME, name, position, rotation)),
         ]
         if self._site is not None:
             made.append(
                 ("location", LOCATION_KIND, LocationFix(at, name, *to_globe(self._site, pose.x, pose.y, pose.z)))
             )
-        return tuple(Derived(topics[what], kind, msgspec.json.encode(value)) for what, kind, value in made)
+        return tuple(Derived(self._topics[what], kind, msgspec.json.encode(value)) for what, kind, value in made)
 
 
 def flat_schema(kind: type[Struct]) -> JsonSchema:
@@ -335,7 +307,7 @@ def _short_kind(kind: type[Struct]) -> ChannelKind:
     return ChannelKind(f"swiftbot.{kind.__name__}", msgspec.json.encode(whole | {"properties": fields}), "json")
 
 
-_OF_VIEW = {"pose": POSE_KIND, "transform": TRANSFORM_KIND, "location": LOCATION_KIND}
+_OF_VIEW = {"transform": TRANSFORM_KIND, "location": LOCATION_KIND}
 
 
 def _kind_of(key: str) -> ChannelKind | None:

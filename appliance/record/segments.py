@@ -28,6 +28,7 @@ from appliance.model import Site, keyspace
 from appliance.model.keys import Keys
 from appliance.model.recorder_api import Deletion, Gap, Incident
 from appliance.plane.backlog import UNKNOWN, kind_of
+from appliance.record.channels import Shared, shared_for
 from appliance.record.mcap_writer import LogFile, McapFile, free_bytes
 from appliance.record.models import LoggedMessage
 from appliance.record.redact import LEAST_SECRET, Redactor, known_secrets, without_secrets
@@ -123,9 +124,11 @@ class OpenLog:
             deletion = msgspec.json.encode(Deletion(key=message.key, at_ns=at_ns))
             self.put(self._keys(keyspace.RECORDER_DELETED, self._config.name), at_ns, deletion)
             return
-        channel = self._channels.get((message.key, message.encoding))
+        shared = shared_for(message.key, message.payload) if message.encoding == JSON else None
+        topic = message.key if shared is None else shared.topic
+        channel = self._channels.get((topic, message.encoding))
         if channel is None:
-            channel = self._register(message.key, message.encoding)
+            channel = self._register(topic, message.encoding, key=message.key, shared=shared)
         self._loose = True
         if self._mcap.add_message(channel.number, at_ns, message.payload):
             self._settle()
@@ -194,9 +197,12 @@ class OpenLog:
     def _keys(self) -> Keys:
         return self._schemas.keys
 
-    def _register(self, topic: str, encoding: str, *, kind: ChannelKind | None = None) -> _Channel:
-        derived = kind is not None
-        kind = kind or self._schemas.kind_of(topic, encoding)
+    def _register(
+        self, topic: str, encoding: str, *, key: str = "", shared: Shared | None = None, kind: ChannelKind | None = None
+    ) -> _Channel:
+        """Announce a channel, of a key or shared by many, or (with a `kind`) of what is derived."""
+        derived, key = kind is not None, key or topic
+        kind = kind or self._schemas.kind_of(key, encoding)
         schema = 0
         if kind.schema:
             schema = self._schema_numbers.get(kind.schema, 0)
@@ -205,8 +211,9 @@ class OpenLog:
                 self._schema_numbers[kind.schema] = schema
         # The metadata lets the reader give back Zenoh's encoding and leave out what the recorder made itself.
         metadata = {"encoding": encoding, **dict(kind.metadata)} | ({"derived": "true"} if derived else {})
+        metadata |= {} if shared is None else shared.metadata
         number = self._mcap.register_channel(topic, kind.encoding, schema, metadata)
-        channel = _Channel(number, None if derived else self._foxglove.deriving(topic))
+        channel = _Channel(number, None if derived else self._foxglove.deriving(key))
         self._channels[topic, encoding] = channel
         return channel
 

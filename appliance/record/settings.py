@@ -48,7 +48,7 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     rotate_s: float = 1800.0
     """A new file after this long."""
     max_channels: int = 10_000
-    """A new file after this many different keys (MCAP has room for 65,535; each task has keys of its own)."""
+    """A new file after this many channels (MCAP has room for 65,535)."""
     free_bytes: int = 256 * 2**20
     """Writing stops while the disk has less free than this, and goes on at an eighth more."""
     total_bytes: int = 8 * 2**30

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from appliance.plane.session import Inbox, Outbox
+from appliance.plane.session import TELEMETRY_PART, Inbox, Outbox
 
 pytestmark = pytest.mark.anyio
 
@@ -86,6 +86,25 @@ async def test_a_stuck_send_holds_up_nobody_but_later_sends() -> None:
     await asyncio.to_thread(outbox.close, 10.0)
     assert sent == [0, 1, 2]
     assert not outbox.send(partial(sent.append, 4), 1)
+
+
+async def test_telemetry_leaves_a_part_of_the_queue_to_everything_else() -> None:
+    """What may fill a part of it is dropped from there on; an order still goes."""
+    outbox = Outbox(messages=8, payload_bytes=1000)
+    stuck, begun = threading.Event(), threading.Event()
+
+    def block() -> None:
+        begun.set()
+        stuck.wait()
+
+    assert outbox.send(block, 1)
+    await asyncio.to_thread(begun.wait)
+    frames = [outbox.send(partial(int, 1), 1, part=TELEMETRY_PART) for _ in range(10)]
+    assert frames.count(True) == 6
+    assert [outbox.send(partial(int, 1), 1) for _ in range(3)] == [True, True, False]
+    assert not outbox.send(partial(int, 1), 900, part=TELEMETRY_PART)
+    stuck.set()
+    await asyncio.to_thread(outbox.close, 10.0)
 
 
 async def test_a_failing_send_does_not_stop_the_others() -> None:

@@ -69,3 +69,38 @@ def test_a_burst_of_pictures_waits_for_room_too() -> None:
     out, drops = intake.take(0)
     assert [len(each.payload) for each in out] == [20] * 4
     assert drops == {}
+
+
+def _put(intake: Intake, key: str, count: int) -> int:
+    """Put so many messages on a key; returns how many were taken."""
+    return sum(intake.put(LoggedMessage(key, 5, b"x")) for _ in range(count))
+
+
+def test_telemetry_is_thinned_before_anything_else_is_lost() -> None:
+    """By the rule: all to three quarters, one in four of each key to seven eighths; orders and tasks to the end."""
+    intake = Intake(messages=800, payload_bytes=10_000)
+    frames, other = "swiftbot/f/robot/drone_1/mavlink/rx", "swiftbot/f/robot/drone_2/state"
+    assert _put(intake, frames, 600) == 600
+    assert _put(intake, frames, 100) == 25
+    assert _put(intake, other, 100) == 25
+    assert _put(intake, frames, 1000) == 50
+    for key in ("task/t-1/transition", "operator/stop/o-1", "robot/drone_1/commanded", "gw/gw-1/log"):
+        assert _put(intake, f"swiftbot/f/{key}", 25) == 25
+    assert _put(intake, "swiftbot/f/task/t-1/transition", 1) == 0
+    out, drops = intake.take(0)
+    assert len(out) == 800
+    assert drops["thinned"].count == 75 + 75 + 950
+    assert drops["thinned"].keys == {"robot/*/mavlink/*": 1025, "robot/*/state": 75}
+    assert drops["queue full"].keys == {"task/*/transition": 1}
+    assert _put(intake, frames, 600) == 600
+
+
+def test_a_batch_with_orders_in_it_keeps_them() -> None:
+    """Of what comes together the telemetry is thinned, however little of it is something else."""
+    intake = Intake(messages=80, payload_bytes=10_000)
+    frames = [LoggedMessage("swiftbot/f/robot/drone_1/mavlink/rx", number, b"x") for number in range(500)]
+    frames[400:400] = [LoggedMessage("swiftbot/f/operator/stop/o-1", 7, b"{}")]
+    intake.put_all(frames)
+    out, drops = intake.take(0)
+    assert "swiftbot/f/operator/stop/o-1" in {each.key for each in out}
+    assert drops["thinned"].count == 501 - len(out)
