@@ -18,6 +18,7 @@ from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
 from appliance.ports import free_port
 from appliance.record import foxglove_bridge
+from appliance.record.channels import topic_of_kind
 from appliance.record.foxglove_bridge import NAME, LiveOptions, LiveView
 from appliance.record.models import LoggedMessage
 from appliance.record.reader import info
@@ -95,14 +96,15 @@ async def test_the_fleet_is_seen_as_in_a_log(sessions: tuple[Session, Session], 
             await asyncio.sleep(0.05)
 
     speaking = asyncio.create_task(speak())
+    states = topic_of_kind(keys.fleet, keyspace.ROBOT)
     wanted = {
-        keys(keyspace.ROBOT, "r1"),
+        states,
         keys(keyspace.STATUS, "g1"),
         keys(keyspace.LOG, "g1"),
         keys(keyspace.MAVLINK, "r1", "rx"),
         keys(keyspace.RECORDER_LOG, NAME),
     }
-    wanted |= {keys(keyspace.RECORDER_VIEW, NAME, "r1", what) for what in ("pose", "transform", "location")}
+    wanted |= {keys(keyspace.RECORDER_VIEW, NAME, what) for what in ("transform", "location")}
     try:
         async with (
             aiohttp.ClientSession() as http,
@@ -118,9 +120,9 @@ async def test_the_fleet_is_seen_as_in_a_log(sessions: tuple[Session, Session], 
         await asyncio.to_thread(view.stop)
         await recorder.stop()
     assert client.heard[keys(keyspace.MAVLINK, "r1", "rx")][0][1] == b"\xfd\x00\x01"
-    assert client.heard[keys(keyspace.ROBOT, "r1")][0][1] == robot
-    pose = msgspec.json.decode(client.heard[keys(keyspace.RECORDER_VIEW, NAME, "r1", "pose")][0][1])
-    assert pose["pose"]["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
+    assert client.heard[states][0][1] == robot
+    frame = msgspec.json.decode(client.heard[keys(keyspace.RECORDER_VIEW, NAME, "transform")][0][1])
+    assert (frame["child_frame_id"], frame["translation"]) == ("r1", {"x": 1.0, "y": 2.0, "z": 0.0})
     said = b"".join(payload for _, payload in client.heard[keys(keyspace.LOG, "g1")])
     assert b"planted-7d1c" not in said
     assert b"x1y2z3" not in said
