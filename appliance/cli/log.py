@@ -154,6 +154,7 @@ def log_layout(
     recorder: Annotated[
         str, Parameter(help="Recorder that writes the log; `live` for `swiftbot foxglove`.")
     ] = "recorder",
+    as_json: Json = True,
     where: Where = HERE,
 ) -> int:
     """Print a layout for Foxglove as JSON: robots in 3D and on the map, log, the task and robot of its variables.
@@ -162,6 +163,7 @@ def log_layout(
     """
     from appliance.record.layout import layout
 
+    del as_json  # a layout is JSON in any case
     show(layout(where.fleet, recorder), as_json=True)
     return Exit.DONE
 
