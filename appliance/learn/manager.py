@@ -313,7 +313,7 @@ class LearnManager:
             need=need_of(manifest), params=params, coordinator=self._plane.gateway, deadline_s=manifest.timeout_s,
             submitter=f"learn {run.id}", priority=PRIORITY,
         )  # fmt: skip
-        return await run_skill(self._plane, request, owner=owner)
+        return await run_skill(self._plane, request, manifest, owner=owner)
 
     async def _evaluate(self, run: RunRecord, model: Model) -> None:
         """Evaluate the model of a round that was just closed, and note it in the run's record."""

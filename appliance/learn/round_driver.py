@@ -38,7 +38,7 @@ from appliance.model.learning import (
     RunRecord,
     UpdateRecord,
 )
-from appliance.model.task_api import ArtifactKeep, RunAsk
+from appliance.model.task_api import ArtifactKeep, RunAsk, RunStatus
 from appliance.plane.node import Plane
 from appliance.plane.records import Record
 from appliance.skills._lib.learning import shards
@@ -108,6 +108,8 @@ class Sent(NamedTuple):
     heard: float
     progress: float = 0.0
     note: str = ""
+    queued: bool = False
+    """Whether its gateway has taken it, and has no container for it yet."""
 
 
 async def write(plane: Plane, key: str, value: Any, expected: VersionVector | None) -> VersionVector:
@@ -186,6 +188,8 @@ class RoundDriver:
         self._versions: dict[str, VersionVector | None] = {}
         """Of the records that this driver writes, by key."""
         self._there: dict[str, str] = {}
+        self._looked = 0.0
+        """The decider's time when it looked last."""
         self._run: RunRecord | None = None
         self._decider: Decider | None = None
         self._told: dict[str, ClientStatus] = {}
@@ -217,6 +221,7 @@ class RoundDriver:
                     since_s=round(now - sent.at, 3) if sent else 0.0,
                     progress=sent.progress if sent else 0.0,
                     note=sent.note if sent else "",
+                    queued=sent.queued if sent else False,
                 )
             )
         return tuple(found)
@@ -262,7 +267,10 @@ class RoundDriver:
         if sent is not None and sent.order.attempt == event.attempt:
             note = event.note if event.kind is RunEventKind.PROGRESS else sent.note
             progress = event.progress if event.kind is RunEventKind.PROGRESS else sent.progress
-            self._sent[key] = sent._replace(heard=time.monotonic(), note=note, progress=progress)
+            if sent.queued:
+                note = "" if note == sent.note else note
+                self.put(rounds.Ordered(key, event.attempt, event.gateway))  # it waits no longer
+            self._sent[key] = sent._replace(heard=time.monotonic(), note=note, progress=progress, queued=False)
         if event.kind in (RunEventKind.SUCCEEDED, RunEventKind.FAILED):
             self._ended(key, event)
 
@@ -376,6 +384,7 @@ class RoundDriver:
         for part in (part for update in updates for part in update.parts):
             self._start(self._fetch(part))
         log.info("coordinating a round", run=self._run_id, round=self.number, orders=len(record.orders))
+        self._looked = now
         await self._carry_out(self._decider.resume(now))
 
     def _tell_decision(self, case: RoundCase) -> None:
@@ -440,19 +449,21 @@ class RoundDriver:
         self._start(self._check_orders())
         self._start(self._keep_publishing())
         while not decider.done:
-            now = time.monotonic()
-            at = decider.next_at(now)
+            # By the time at which it looked last: what has become due since then would else be overlooked for ever.
+            at = decider.next_at(self._looked)
             try:
-                async with asyncio.timeout(None if at is None else max(0.0, at - now)):
+                async with asyncio.timeout(None if at is None else max(0.0, at - time.monotonic())):
                     event = await self._events.get()
             except TimeoutError:
-                await self._carry_out(decider.advance(time.monotonic()))
+                self._looked = time.monotonic()
+                await self._carry_out(decider.advance(self._looked))
                 continue
             instructions: list[Instruction] = []
             while True:
                 if isinstance(event, rounds.Changed):
                     self._run = event.run
-                instructions += decider.handle(event, time.monotonic())
+                self._looked = time.monotonic()
+                instructions += decider.handle(event, self._looked)
                 if self._events.empty():
                     break
                 event = self._events.get_nowait()
@@ -774,6 +785,15 @@ class RoundDriver:
             self._ended(key, status.last)
         elif not status.running:
             self.put(rounds.Failed(key, order.attempt, f"{order.gateway} knows nothing of it", transient=True))
+        elif status.position:
+            reason = f"waits for a container at {order.gateway}, {status.position} of {status.queue} in line"
+            if (sent := self._sent[key]).order.attempt == order.attempt:
+                self._sent[key] = sent._replace(note=reason, queued=True)
+            self.put(rounds.Waiting(key, order.attempt, reason))
+        elif problem := stuck(status, self._site.manifest(TRAIN)):
+            self._avoid.setdefault(key, set()).add(order.gateway)
+            await self._cancel(order)
+            self.put(rounds.Failed(key, order.attempt, f"{order.gateway}: {problem}"))
 
     async def _check_orders(self) -> None:
         """Ask after the orders of which nothing was heard for a while: an event may have been lost."""
@@ -889,25 +909,25 @@ class RoundDriver:
 
     async def run_here(self, skill: str, name: str, params: dict[str, Any], *, owner: str) -> dict[str, Any]:
         """Run a skill, here or where this gateway passes it on, and return its result; SwiftbotError if it fails."""
-        return await run_skill(self._plane, self._run_request(skill, name, 1, params), owner=owner, attempts=1)
+        request = self._run_request(skill, name, 1, params)
+        return await run_skill(self._plane, request, self._site.manifest(skill), owner=owner, attempts=1)
 
 
 async def run_skill(
-    plane: Plane, request: RunRequest, *, owner: str, gateway: str = "", attempts: int = 3
+    plane: Plane, request: RunRequest, manifest: SkillManifest, *, owner: str, attempts: int = 3
 ) -> dict[str, Any]:
     """Have a skill run, and return its result.
 
     Args:
         plane: the fleet.
-        request: what to run; its attempt is the first.
+        request: what to run, here or where this gateway passes it on; its attempt is the first.
+        manifest: of its skill.
         owner: record that its files go with.
-        gateway: where; empty: here.
         attempts: how often it is tried.
 
     Raises:
         SwiftbotError: it fails so many times.
     """
-    at = gateway or plane.gateway
     problem: SwiftbotError | None = None
     for attempt in range(request.attempt, request.attempt + attempts):
         ended: asyncio.Future[RunEvent] = asyncio.get_running_loop().create_future()
@@ -920,8 +940,8 @@ async def run_skill(
         hearing = plane.session.subscribe_typed(keyspace.RUN_EVENT, hear, request.task, request.subtask)
         try:
             sent = replace(request, attempt=attempt, owner=owner)
-            accepted = await _until_room(partial(plane.rpc.call, at, keyspace.RUN, sent))
-            event = await _end_of(plane, accepted.gateway, sent, ended)
+            accepted = await _until_room(partial(plane.rpc.call, plane.gateway, keyspace.RUN, sent))
+            event = await _end_of(plane, accepted.gateway, sent, manifest, ended)
         except SwiftbotError as error:
             problem = error
             continue
@@ -948,8 +968,10 @@ async def _until_room(call: Callable[[], Awaitable[Any]]) -> Any:
             wait_s = min(LONGEST_SEND_S, 2 * wait_s)
 
 
-async def _end_of(plane: Plane, gateway: str, sent: RunRequest, ended: "asyncio.Future[RunEvent]") -> RunEvent:
-    """Wait for a run's end, which is told, or known to its gateway."""
+async def _end_of(
+    plane: Plane, gateway: str, sent: RunRequest, manifest: SkillManifest, ended: "asyncio.Future[RunEvent]"
+) -> RunEvent:
+    """Wait for a run's end, which is told, or known to its gateway; one that is stuck is ended (DeadlineError)."""
     ask = RunAsk(task=sent.task, subtask=sent.subtask, attempt=sent.attempt)
     while True:
         with contextlib.suppress(TimeoutError):
@@ -960,6 +982,17 @@ async def _end_of(plane: Plane, gateway: str, sent: RunRequest, ended: "asyncio.
             return status.last
         if not status.running:
             raise UnreachableError(f"{gateway} knows nothing of {sent.run_id} any more")
+        if problem := stuck(status, manifest):
+            with contextlib.suppress(SwiftbotError):
+                await plane.rpc.call(gateway, keyspace.RUN_CANCEL, ask)
+            raise DeadlineError(f"{sent.skill} at {gateway}: {problem}")
+
+
+def stuck(status: RunStatus, manifest: SkillManifest) -> str:
+    """Why a run in progress is given up: it is silent for longer than its skill promises. Empty: it is not."""
+    if not manifest.silent_s or status.silent_s is None or status.silent_s <= manifest.silent_s:
+        return ""
+    return f"no sign of life for {status.silent_s:.0f} s, {manifest.id} promises one every {manifest.silent_s:g} s"
 
 
 def _verdicts(result: dict[str, Any], clients: set[str]) -> tuple[dict[str, str], dict[str, str]]:

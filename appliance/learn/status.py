@@ -101,12 +101,16 @@ def _at_work(
         why = own.note or client.note
         if own.round and own.round < run.round:
             return Activity.LATE, why
-        return (Activity.TRAINING if own.gateway else Activity.WAITING), why
+        return _begun(own), why
     assert helping is not None  # noqa: S101 - the caller has one of both
     why = f"helps {helping.client}" + (f": {helping.note}" if helping.note else "")
     if order is not None and order.given_up:
         why += f"; left out: {order.given_up}"
-    return (Activity.TRAINING if helping.gateway else Activity.WAITING), why
+    return _begun(helping), why
+
+
+def _begun(at_work: Working) -> Activity:
+    return Activity.TRAINING if at_work.gateway and not at_work.queued else Activity.WAITING
 
 
 def _eta_s(at_work: Working, order: Order | None, epoch_s: float | None) -> float | None:

@@ -70,7 +70,9 @@ class Working(Struct, frozen=True, kw_only=True, omit_defaults=True):
     since_s: float = 0.0
     progress: float = 0.0
     note: str = ""
-    """What its run told last, or why it is not sent yet."""
+    """What its run told last, or why it is not sent yet, or waits at its gateway."""
+    queued: bool = False
+    """Whether its gateway has taken it, and has no container for it yet."""
 
 
 class LearnShown(Struct, frozen=True, kw_only=True, omit_defaults=True):

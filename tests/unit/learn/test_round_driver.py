@@ -1,6 +1,8 @@
 """The shell of a round: what it sends to gateways and writes, with a fleet of one gateway that is played here."""
 
 import asyncio
+import sys
+import time
 from collections import Counter
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -29,11 +31,13 @@ from appliance.model.learning import (
     Closed,
     Counted,
     Data,
+    Mode,
     Model,
     Order,
     PartialUpdate,
     Recipe,
     RoundRecord,
+    Rounds,
     RunRecord,
     RunState,
     Side,
@@ -66,6 +70,8 @@ class Fleet:
         self.cancelled: list[str] = []
         self.news: list[tuple[object, Any]] = []
         self.gateway = "gw-1"
+        self.status = RunStatus(running=True)
+        """What is answered of each run."""
         self.dht = self.rpc = self.session = self.ring = self
         self.registry = SimpleNamespace(gateways={}, robots={})
         self._answers, self._kept = answers, kept
@@ -78,7 +84,9 @@ class Fleet:
         )  # fmt: skip
 
     def _manifest(self, skill: str) -> Any:
-        return SimpleNamespace(image="learn", cpu=1.0, memory_mb=256, volumes=(), timeout_s=60.0, id=skill)
+        return SimpleNamespace(
+            image="learn", cpu=1.0, memory_mb=256, volumes=(), timeout_s=60.0, silent_s=120.0, id=skill
+        )
 
     def members(self) -> frozenset[str]:
         """Return the one gateway."""
@@ -130,7 +138,7 @@ class Fleet:
         assert isinstance(ask, RunAsk)
         if verb is keyspace.RUN_CANCEL:
             self.cancelled.append(ask.run_id)
-        return RunStatus(running=True)
+        return self.status
 
     def _tell(self, event: RunEvent) -> None:
         self.driver.heard(event)
@@ -450,3 +458,77 @@ async def test_a_client_is_given_what_coding_left_over_of_its_last_update() -> N
     assert params["part-001"]["residual"] == []
     helped = fleet.driver._train_params(Order(client="part-000", round=1, part=1))  # pyright: ignore[reportPrivateUsage]
     assert helped["residual"] == []
+
+
+async def test_a_client_without_a_sign_of_life_is_tried_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its gateway says that it runs and was silent for longer than its skill promises: ended, and ordered again."""
+    monkeypatch.setattr(round_driver, "CHECK_S", 0.01)
+    fleet = Fleet(RUN)
+    driving = asyncio.create_task(fleet.driver.drive())
+    await until(lambda: len(fleet.asked) == 2)
+    fleet.status = RunStatus(running=True, silent_s=119.0)
+    await asyncio.sleep(0.1)
+    assert len(fleet.asked) == 2
+    fleet.status = RunStatus(running=True, silent_s=121.0)
+    await until(lambda: any(request.attempt == 3 for request in fleet.asked))
+    driving.cancel()
+    assert {"r.1/part-000/1", "r.1/part-001/1"} <= set(fleet.cancelled)
+    assert all(order.failures for order in fleet.round().orders)
+
+
+async def test_an_aggregation_without_a_sign_of_life_is_run_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is ended, and another run of it begins: the round does not wait for the end of its time."""
+    monkeypatch.setattr(round_driver, "CHECK_S", 0.01)
+    monkeypatch.setattr(rounds, "RETRY_S", 0.01)
+    fleet = Fleet(RUN, answers=lambda request: None if request.skill == round_driver.AGGREGATE else trained(request))
+    fleet.status = RunStatus(running=True, silent_s=300.0)
+    driving = asyncio.create_task(fleet.driver.drive())
+    await until(lambda: sum(request.skill == round_driver.AGGREGATE for request in fleet.asked) >= 2)
+    driving.cancel()
+    first = next(request for request in fleet.asked if request.skill == round_driver.AGGREGATE)
+    assert first.run_id in fleet.cancelled
+
+
+async def test_a_client_that_waits_for_a_container_says_so_until_it_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Taken by its gateway it is second in line there: it waits, with the reason, and trains once its run begins."""
+    monkeypatch.setattr(round_driver, "CHECK_S", 0.01)
+    fleet = Fleet(RUN)
+    fleet.status = RunStatus(running=True, position=2, queue=3)
+    driving = asyncio.create_task(fleet.driver.drive())
+    reason = "waits for a container at gw-1, 2 of 3 in line"
+    await until(lambda: [(each.state, each.why) for each in fleet.driver.clients()] == [("waiting", reason)] * 2)
+    record = fleet.driver.record()
+    assert record is not None
+    assert f"part-000 ({reason})" in record.waits
+    fleet.status = RunStatus(running=True)
+    for request in fleet.asked:
+        fleet.driver.heard(ended(request, kind=RunEventKind.STARTED))
+    await until(lambda: reason not in (fleet.driver.record() or record).waits)
+    assert [(each.state, each.why) for each in fleet.driver.clients()] == [("training", "")] * 2
+    driving.cancel()
+
+
+async def test_what_becomes_due_between_two_looks_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A timer that is a hair early looks just before a client's time is over: the round closes without it all the same.
+
+    The loop's first look at the clock after that time is 0.1 ms before it here, as an early timer's is.
+    """
+    recipe = Recipe(model="clips", clients=Clients(partitions=2), rounds=Rounds(mode=Mode.SYNC, timeout_s=0.2))
+    fleet = Fleet(
+        replace(RUN, recipe=recipe), answers=lambda ask: trained(ask) if ask.subtask == "part-000" else None
+    )
+    early: list[float] = []
+
+    def clock() -> float:
+        now = time.monotonic()
+        record, loop = fleet.driver._decider, sys._getframe(1).f_code.co_name == "_loop"
+        if record is not None and loop and not early and now >= record._opened + 0.2:
+            early.append(record._opened + 0.1999)
+            return early[0]
+        return now
+
+    monkeypatch.setattr(round_driver, "time", SimpleNamespace(monotonic=clock, time_ns=time.time_ns))
+    driving = asyncio.create_task(fleet.driver.drive())
+    await until(lambda: any(request.skill == round_driver.AGGREGATE for request in fleet.asked))
+    driving.cancel()
+    assert early
