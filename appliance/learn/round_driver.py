@@ -286,9 +286,15 @@ class RoundDriver:
         if event.kind is RunEventKind.FAILED:
             failure = event.failure
             reason = failure.message if failure is not None else "it failed without a reason"
-            transient = failure is not None and failure.code in TRANSIENT
+            # Of a pool's failures that of a run which has not begun is none of its client: it had no container.
+            waited = failure is not None and failure.code == "pool" and event.duration_ms is None
+            transient = waited or (failure is not None and failure.code in TRANSIENT)
             self._avoid.setdefault(key, set()).add(event.gateway)
-            self.put(rounds.Failed(key, event.attempt, f"{event.gateway}: {reason}", transient=transient))
+            reason = f"{event.gateway}: {reason}"
+            sent = self._sent.get(key)
+            if sent is not None and sent.order.attempt == event.attempt:
+                self._sent[key] = sent._replace(note=reason, queued=False)  # until it is sent again
+            self.put(rounds.Failed(key, event.attempt, reason, transient=transient))
             return
         order = self._decider.order(key) if self._decider is not None else None
         if order is None:

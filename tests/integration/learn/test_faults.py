@@ -167,7 +167,7 @@ async def test_without_a_free_container_a_round_waits_and_says_why(tmp_path: Pat
     """The only container trains for another run: `show` and `why` say so; once it is free the run goes on."""
     make_clips(tmp_path / "data" / "clips", CLIPS)
     write_model(tmp_path / "data", "sound")
-    pool = PoolConfig(floor={"learn": 1}, capacity=1, queue_wait_s=3.0, folders={"learning": str(tmp_path / "data")})
+    pool = PoolConfig(floor={"learn": 1}, capacity=1, queue_wait_s=10.0, folders={"learning": str(tmp_path / "data")})
     recipe = Recipe(
         model="sound", data=Data(name="clips"), clients=Clients(partitions=1, by="even"),
         rounds=Rounds(count=1, mode=Mode.SYNC), evaluation=Evaluation(every=0),

@@ -514,9 +514,7 @@ async def test_what_becomes_due_between_two_looks_is_not_overlooked(monkeypatch:
     The loop's first look at the clock after that time is 0.1 ms before it here, as an early timer's is.
     """
     recipe = Recipe(model="clips", clients=Clients(partitions=2), rounds=Rounds(mode=Mode.SYNC, timeout_s=0.2))
-    fleet = Fleet(
-        replace(RUN, recipe=recipe), answers=lambda ask: trained(ask) if ask.subtask == "part-000" else None
-    )
+    fleet = Fleet(replace(RUN, recipe=recipe), answers=lambda ask: trained(ask) if ask.subtask == "part-000" else None)
     early: list[float] = []
 
     def clock() -> float:
@@ -532,3 +530,19 @@ async def test_what_becomes_due_between_two_looks_is_not_overlooked(monkeypatch:
     await until(lambda: any(request.skill == round_driver.AGGREGATE for request in fleet.asked))
     driving.cancel()
     assert early
+
+
+@pytest.mark.parametrize(("took_ms", "attempts"), [(None, 0), (50.0, 1)])
+async def test_to_stand_in_line_in_vain_uses_up_no_attempt(took_ms: float | None, attempts: int) -> None:
+    """Half a minute without a free container is no fault of the client; a container that dies under its run may be."""
+    failure = Failure(code="pool", message="no container came free within 30 s")
+    fleet = Fleet(RUN, answers=lambda ask: ended(ask, kind=RunEventKind.FAILED, failure=failure, duration_ms=took_ms))
+    driving = asyncio.create_task(fleet.driver.drive())
+    await until(lambda: len(fleet.asked) >= 4)
+    driving.cancel()
+    assert all(order.failures >= attempts if attempts else not order.failures for order in fleet.round().orders)
+    record = fleet.driver.record()
+    assert record is not None
+    if not attempts:
+        assert "part-000 (gw-1: no container came free within 30 s)" in record.waits
+        assert {each.why for each in fleet.driver.clients()} == {"gw-1: no container came free within 30 s"}
