@@ -292,7 +292,7 @@ class Gateway:
         enquiries.start(audit)
         self._stack.push_async_callback(enquiries.close)
         telling = Telling(self.plane, on_event=self._kept.hear_event)
-        calls = Calls(
+        self._calls = calls = Calls(
             self.plane,
             artifacts,
             copies=copies,
@@ -411,6 +411,7 @@ class Gateway:
             keep_ended=self.config.tasks.keep_runs,
             tell_decisions=self.config.tasks.tell_decisions,
         )
+        self._calls.offer("masks", self.learn.masks)
         await self.learn.start(audit)
         self._stack.push_async_callback(self.learn.stop)
         return Retention(self.plane, self.config.tasks, artifacts, needed=self.learn.needed)

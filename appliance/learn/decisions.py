@@ -158,12 +158,14 @@ def _order(order: Order) -> str:
     return f"{order.subtask} of round {order.round}, attempt {order.attempt}{helper}{share}{stop}{given_up}"
 
 
-def line(instruction: Instruction) -> str:
+def line(instruction: Instruction) -> str:  # noqa: PLR0911 - one line for each instruction
     """Return an instruction in words, with digests of what the words leave out."""
     match instruction:
         case rounds.WriteRound(record):
             orders = "; ".join(map(_order, record.orders[:MOST_LISTED]))
             return f"write round {record.number}, {len(record.orders)} orders [{orders}] {_digest(record)}"
+        case rounds.MakeKeys(number, clients):
+            return f"make keys for round {number}: {', '.join(clients[:MOST_LISTED])} {_digest(clients)}"
         case rounds.Send(order):
             return f"send {_order(order)} {_digest(order)}"
         case rounds.Cancel(order):

@@ -28,7 +28,7 @@ from appliance.errors import (
     UnreachableError,
 )
 from appliance.learn import recipe as recipes
-from appliance.learn import records, rounds
+from appliance.learn import records, rounds, secagg
 from appliance.learn.round_driver import (
     EVALUATE,
     PRIORITY,
@@ -53,18 +53,36 @@ from appliance.model.learn_api import (
     LearnEvaluated,
     LearnExportAsk,
     LearnExported,
+    LearnHeld,
+    LearnHoldAsk,
+    LearnKeys,
+    LearnKeysAsk,
     LearnRuns,
     LearnRunsAsk,
+    LearnShareAsk,
+    LearnShares,
     LearnShowAsk,
     LearnShown,
     LearnStartAsk,
     LearnSteerAsk,
+    LearnUnmaskAsk,
+    LearnUnmasked,
     Steering,
 )
-from appliance.model.learning import ClientState, Model, Recipe, Reference, RoundRecord, RunRecord, RunState
+from appliance.model.learning import (
+    MOST_CLIENTS,
+    ClientState,
+    Model,
+    Recipe,
+    Reference,
+    RoundRecord,
+    RunRecord,
+    RunState,
+)
 from appliance.plane.events import FactsChanged, FleetEvent, Joined, Lost, Relinked, RingChanged, Stage
 from appliance.plane.node import Plane
 from appliance.plane.session import Closer
+from appliance.pool.pool import Call
 from appliance.skills._lib.learning import loading, models
 from appliance.skills._lib.learning.listings import DataError
 from appliance.skills._lib.learning.models import ModelError
@@ -119,6 +137,7 @@ class LearnManager:
         self._artifacts = artifacts
         self.refused = Counter[str]()
         self._site = Site(plane, artifacts, manifest, copies, self.refused, tell_decisions)
+        self._keys = secagg.Holder(plane.gateway)
         self._drivers: dict[str, RoundDriver] = {}
         """Run -> the driver of its open round, where that is this gateway's."""
         self._driving: dict[str, asyncio.Task[None]] = {}
@@ -136,6 +155,10 @@ class LearnManager:
         rpc.register(keyspace.LEARN_SHOW, self.show)
         rpc.register(keyspace.LEARN_EVAL, self.evaluate)
         rpc.register(keyspace.LEARN_EXPORT, self.export)
+        rpc.register(keyspace.LEARN_KEYS, self.keys)
+        rpc.register(keyspace.LEARN_SHARE, self.share)
+        rpc.register(keyspace.LEARN_HOLD, self.hold)
+        rpc.register(keyspace.LEARN_UNMASK, self.unmask)
         signed = {do: audit.signed(f"learn_{do}", self.steer) for do in get_args(Steering)}
 
         async def steer(ask: LearnSteerAsk) -> RunRecord:
@@ -396,6 +419,7 @@ class LearnManager:
         except ModelError as error:
             raise ConfigError(f"recipe: model: {error}", remedy="see docs/learning.md for the models") from error
         most_samples = await self._check_data(ask.recipe)
+        recipes.check_secure(ask.recipe, self._present(ask.recipe), most_samples)
         run = RunRecord(
             id=ask.id,
             recipe=ask.recipe,
@@ -449,6 +473,27 @@ class LearnManager:
         return LearnData(
             found=tuple(await asyncio.to_thread(lambda: [_found(self._folder, each) for each in ask.paths]))
         )
+
+    async def keys(self, ask: LearnKeysAsk) -> LearnKeys:
+        """Answer `learn_keys`."""
+        return LearnKeys(keys=self._keys.advertise(ask.epoch, ask.clients[:MOST_CLIENTS]))
+
+    async def share(self, ask: LearnShareAsk) -> LearnShares:
+        """Answer `learn_share`."""
+        return LearnShares(sealed=await asyncio.to_thread(self._keys.share, ask.cohort))
+
+    async def hold(self, ask: LearnHoldAsk) -> LearnHeld:
+        """Answer `learn_hold`."""
+        return LearnHeld(clients=await asyncio.to_thread(self._keys.hold, ask.cohort, ask.sealed))
+
+    async def unmask(self, ask: LearnUnmaskAsk) -> LearnUnmasked:
+        """Answer `learn_unmask`."""
+        return LearnUnmasked(revealed=self._keys.unmask(ask.epoch, ask.summed))
+
+    async def masks(self, call: Call) -> dict[str, Any]:
+        """Answer a handler that trains for a client here: `{"masks": [[seed in hex, 1 or -1], …]}`."""
+        seeds = await asyncio.to_thread(self._keys.masks, str(call.args.get("epoch", "")), call.run.subtask)
+        return {"masks": [[each.seed.hex(), each.sign] for each in seeds]}
 
     async def runs(self, _: LearnRunsAsk) -> LearnRuns:
         """Answer `learn_runs`."""

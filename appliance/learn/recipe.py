@@ -4,6 +4,7 @@ A recipe is one TOML file (docs/learning.md), read strictly, so that a typing er
 """
 
 import contextlib
+import math
 import tomllib
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -12,12 +13,12 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from appliance.errors import ConfigError, PayloadError
-from appliance.learn import rounds
+from appliance.errors import ConfigError, PayloadError, RefusedError
+from appliance.learn import rounds, secagg
 from appliance.model.keys import check_name
 from appliance.model.learn_api import DataFound
 from appliance.model.learning import Clients, Mode, Recipe
-from appliance.skills._lib.learning import robust
+from appliance.skills._lib.learning import masks, robust
 
 BUILT_IN = Path(__file__).parent / "recipes"
 """Recipes of the models that come with the product, `NAME.toml`."""
@@ -129,11 +130,68 @@ def check(recipe: Recipe, source: str) -> None:
             robust.check_krum(per_round, int(rule["hostile"]))
     except ValueError as error:
         raise wrong("update.rule", str(error), "mean, median, trimmed:SHARE or multikrum:HOSTILE") from error
+    if recipe.update.secagg:
+        _check_secagg(recipe, wrong)
     unknown = sorted(recipe.emulation.speeds.keys() - set(recipe.names))
     if unknown:
         raise wrong("emulation.speeds", f"no client {unknown[0]!r}", f"clients are {', '.join(recipe.names[:8])}")
     if recipe.emulation.speeds and recipe.emulation.nominal_batch_s is None:
         raise wrong("emulation.nominal_batch_s", "is missing", "seconds that a batch takes a nominal device")
+
+
+def _check_secagg(recipe: Recipe, wrong: Callable[[str, str, str], ConfigError]) -> None:
+    """Secure aggregation goes with what needs the sum of one cohort's updates and nothing of a single one."""
+    masked = "update.secagg is true, and nothing of a single update can be read"
+    if recipe.rounds.mode not in (Mode.AUTO, Mode.SYNC):
+        raise wrong("rounds.mode", f"{recipe.rounds.mode} with update.secagg, whose masks cancel for one cohort only",
+                    'leave it out, or set it to "sync"')  # fmt: skip
+    if recipe.update.rule != "mean":
+        raise wrong("update.rule", f"{recipe.update.rule} compares updates: {masked}", 'set it to "mean"')
+    if recipe.update.compression != "none":
+        raise wrong("update.compression", f"{recipe.update.compression} with update.secagg, whose masks need all bits",
+                    'set it to "none"')  # fmt: skip
+    if recipe.training.checkpoint_steps:
+        raise wrong("training.checkpoint_steps", "with update.secagg: a checkpoint is an update without masks",
+                    "set it to 0")  # fmt: skip
+    if not recipe.clients.robots:
+        raise wrong("update.secagg", "with partitions of a data set that all gateways have: there is nothing to hide",
+                    "name clients.robots, each with data of its own")  # fmt: skip
+    wanted = recipe.clients.per_round or len(recipe.names)
+    chosen = min(len(recipe.names), math.ceil(wanted * recipe.clients.over_selection))
+    if wanted < secagg.LEAST:
+        raise wrong("update.secagg", f"with {wanted} clients a round: the sum of two tells each the other's update",
+                    f"take at least {secagg.LEAST}")  # fmt: skip
+    if wanted < secagg.threshold(chosen):
+        raise wrong("clients.over_selection", f"{wanted} of {chosen} clients are waited for, masks of that cohort need "
+                    f"{secagg.threshold(chosen)}", "lower it")  # fmt: skip
+
+
+def check_secure(recipe: Recipe, places: Mapping[str, str], most_samples: int) -> None:
+    """Check of secure aggregation what the fleet decides.
+
+    Args:
+        recipe: of the run.
+        places: client -> its gateway, of those that are there.
+        most_samples: items of the largest data set; 0: not known.
+
+    Raises:
+        ConfigError: a sum may not fit, or a gateway has the keys of so many that it could read the others' updates.
+    """
+    if not recipe.update.secagg:
+        return
+    if not most_samples:
+        raise ConfigError(
+            "recipe: update.secagg: how many samples clients have is not known, so sums may not fit",
+            remedy="see that the robots' gateways answer",
+        )
+    try:
+        masks.check_bits(len(recipe.names), most_samples)
+        if not recipe.clients.per_round:
+            secagg.check_spread(places)
+    except (ValueError, RefusedError) as error:
+        raise ConfigError(
+            f"recipe: update.secagg: {error}", remedy="secure aggregation needs robots at several gateways"
+        ) from error
 
 
 def _check_data_set(recipe: Recipe, wrong: Callable[[str, str, str], ConfigError]) -> None:

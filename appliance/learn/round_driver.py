@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import hashlib
 import random
+import secrets
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
@@ -21,17 +22,26 @@ from msgspec.structs import replace
 
 from appliance.errors import ConflictError, DeadlineError, PayloadError, SwiftbotError, UnreachableError
 from appliance.learn import recipe as recipes
-from appliance.learn import records, rounds
+from appliance.learn import records, rounds, secagg
 from appliance.learn.decisions import NAME, RoundCase, TracedDecider
 from appliance.learn.rounds import Decider, Event, Instruction, Key
 from appliance.learn.status import metric, statuses
 from appliance.model import RunEvent, RunEventKind, RunRequest, VersionVector, encode, keyspace
-from appliance.model.learn_api import Working
+from appliance.model.learn_api import (
+    LearnHoldAsk,
+    LearnKeysAsk,
+    LearnShareAsk,
+    LearnUnmaskAsk,
+    LearnUnmasked,
+    Working,
+)
 from appliance.model.learning import (
     ClientStatus,
+    Cohort,
     Model,
     Order,
     PartialUpdate,
+    PublicKeys,
     Recipe,
     Reference,
     RoundRecord,
@@ -42,6 +52,7 @@ from appliance.model.task_api import ArtifactKeep, RunAsk, RunStatus
 from appliance.plane.node import Plane
 from appliance.plane.records import Record
 from appliance.skills._lib.learning import shards
+from appliance.skills._lib.learning.masks import Seed
 from appliance.skills._lib.learning.seeds import seed
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.artifacts import Artifacts
@@ -177,8 +188,8 @@ class RoundDriver:
         self._present = present
         self._closed = closed
         self._events: asyncio.Queue[Event] = asyncio.Queue()
-        self._work: set[asyncio.Task[None]] = set()
-        self._cancelling: set[asyncio.Task[None]] = set()
+        self._work: set[asyncio.Task[object]] = set()
+        self._cancelling: set[asyncio.Task[object]] = set()
         self._sent: dict[Key, Sent] = {}
         self._aggregation_failed = False
         self._avoid: dict[Key, set[str]] = {}
@@ -322,13 +333,13 @@ class RoundDriver:
                 manifest=msgspec.convert(result["manifest"], dict[str, Any]),
                 shards=msgspec.convert(result["shards"], tuple[Reference, ...]),
                 samples=msgspec.convert(result["samples"], int),
-                coding=msgspec.convert(result.get("coding", "none"), Literal["none", "int8"]),
+                coding=msgspec.convert(result.get("coding", "none"), Literal["none", "int8", "masked"]),
                 residual=tuple(
                     {key: each[key] for key in ("artifact", "bytes", "gateway")}
                     for each in msgspec.convert(result.get("residual", ()), tuple[Reference, ...])
                 ),
                 steps=msgspec.convert(result["steps"], int),
-                steps_whole=msgspec.convert(result["steps_of_epoch"], int),
+                steps_whole=msgspec.convert(result["steps_of_epoch"], int) * self._recipe().training.epochs,
                 loss=msgspec.convert(result.get("loss"), float | None),
                 classes=self._other_classes(msgspec.convert(result.get("classes", ()), tuple[str, ...])),
                 took_s=round(took or msgspec.convert(result.get("train_s", 0.0), float), 4),
@@ -488,6 +499,8 @@ class RoundDriver:
             match instruction:
                 case rounds.WriteRound():
                     await self._write(instruction.record)
+                case rounds.MakeKeys():
+                    self._start(self._make_keys(instruction))
                 case rounds.Send():
                     self._start(self._send(instruction.order))
                 case rounds.Ask():
@@ -519,13 +532,13 @@ class RoundDriver:
             if error is not None:
                 raise error
 
-    def _start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def _start(self, work: Coroutine[Any, Any, object]) -> asyncio.Task[object]:
         task = asyncio.create_task(work)
         self._work.add(task)
         task.add_done_callback(self._work_done)
         return task
 
-    def _work_done(self, task: "asyncio.Task[None]") -> None:
+    def _work_done(self, task: "asyncio.Task[object]") -> None:
         self._work.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             log.error("work for a round broke", run=self._run_id, round=self.number, exc_info=error)
@@ -591,8 +604,12 @@ class RoundDriver:
                 self._publish(self._signed(record))
             await asyncio.sleep(CLIENT_NEWS_S)
 
-    async def _fetch(self, update: PartialUpdate) -> None:
-        """Copy an update's files here: the gateway that made them may go before they are summed."""
+    async def _fetch(self, update: PartialUpdate) -> str:
+        """Copy an update's files here: the gateway that made them may go before they are summed.
+
+        Returns:
+            Why they could not be copied; empty: they are here.
+        """
         owner = records.round_key(self._run_id, update.round)
         here = self._plane.gateway
         async with self._fetching:
@@ -605,7 +622,8 @@ class RoundDriver:
                     await self._plane.rpc.call(here, keyspace.ARTIFACT_KEEP, ask, timeout_s=KEEP_S)
                 except SwiftbotError as error:  # it is tried once more where it is summed
                     log.info("an update is not copied", client=update.client, reason=error.message)
-                    return
+                    return error.message
+        return ""
 
     async def _close(self, result: rounds.Result) -> None:
         """Change the run's record, which closes the round; then write the round's and open the next."""
@@ -764,7 +782,13 @@ class RoundDriver:
             "compression": recipe.update.compression,
             # What helpers' parts leave over is the client's: one of them adds all of it.
             "residual": [list(each) for each in client.residual] if client is not None and not order.part else [],
+            "secure": self._epoch(),
         }
+
+    def _epoch(self) -> str:
+        """The name of the masks that updates of this round are sent with; empty: they are sent without."""
+        record = self.record()
+        return record.cohort.epoch if record is not None and record.cohort is not None else ""
 
     def _base(self, order: Order) -> Model:
         """The model that an order begins with: that of its own round, which may be an earlier one."""
@@ -817,12 +841,88 @@ class RoundDriver:
             with contextlib.suppress(SwiftbotError):
                 await self._plane.rpc.call(order.gateway, keyspace.RUN_CANCEL, ask)
 
+    # --- secure aggregation ---------------------------------------------------------------------------------------
+
+    async def _make_keys(self, make: rounds.MakeKeys) -> None:
+        """Have the clients of a cohort agree on masks."""
+        try:
+            self.put(rounds.Keyed(await self._agree(make.clients)))
+        except Exception as error:  # the round waits for this task alone: it must end in an event
+            if not isinstance(error, SwiftbotError):
+                log.exception("making keys broke", run=self._run_id, round=self.number)
+            self.put(rounds.Unkeyed(getattr(error, "message", str(error))[:300]))
+
+    async def _agree(self, clients: tuple[str, ...]) -> Cohort:
+        """Return the cohort of those clients whose gateways answer; SwiftbotError where it cannot be."""
+        epoch, members = secrets.token_hex(16), self._plane.members()
+        here: dict[str, list[str]] = {}
+        for client in clients:
+            if (gateway := self._there.get(client, "")) in members:
+                here.setdefault(gateway, []).append(client)
+        asks = [self._keys_at(gateway, LearnKeysAsk(epoch=epoch, clients=tuple(here[gateway]))) for gateway in here]
+        keys = [key for found in await asyncio.gather(*asks) for key in found]
+        secagg.check_spread({key.client: key.gateway for key in keys})
+        cohort = Cohort(epoch=epoch, clients=tuple(sorted(keys, key=lambda key: key.client)))
+        places = {key.client: key.gateway for key in keys}
+        gateways = sorted(set(places.values()))
+        call, ask = self._plane.rpc.call, LearnShareAsk(cohort=cohort)
+        shares = await asyncio.gather(*(call(gateway, keyspace.LEARN_SHARE, ask) for gateway in gateways))
+        sealed = [each for found in shares for each in found.sealed]
+        for_each = {
+            gateway: LearnHoldAsk(cohort=cohort, sealed=tuple(s for s in sealed if places.get(s.to) == gateway))
+            for gateway in gateways
+        }
+        await asyncio.gather(*(call(gateway, keyspace.LEARN_HOLD, ask) for gateway, ask in for_each.items()))
+        return cohort
+
+    async def _keys_at(self, gateway: str, ask: LearnKeysAsk) -> list[PublicKeys]:
+        """Ask a gateway for keys of its clients; none where it does not answer."""
+        try:
+            found = await self._plane.rpc.call(gateway, keyspace.LEARN_KEYS, ask)
+        except SwiftbotError as error:
+            log.info("clients get no keys", run=self._run_id, gateway=gateway, reason=error.message)
+            return []
+        return [key for key in found.keys if key.gateway == gateway and key.client in ask.clients]
+
+    async def _leftover(self, aggregate: rounds.Aggregate, cohort: Cohort) -> list[Seed] | rounds.TooFew:
+        """Return the masks that are left in the sum of some updates, or why there is no such sum.
+
+        Raises:
+            UnreachableError: gateways that have shares of them do not answer.
+        """
+        lost: dict[str, str] = {}
+        for share, gone in zip(
+            aggregate.shares,
+            await asyncio.gather(*(self._fetch(share.update) for share in aggregate.shares)),
+            strict=True,
+        ):
+            if gone:  # as long as no share was given away, its client may still drop out
+                lost[share.update.client] = f"lost: {gone}"
+        if lost:
+            return rounds.TooFew(1, {}, lost)
+        summed = tuple(sorted(share.update.client for share in aggregate.shares))
+        ask = LearnUnmaskAsk(epoch=cohort.epoch, summed=summed)
+        gateways = sorted({each.gateway for each in cohort.clients} & self._plane.members())
+        answers = await asyncio.gather(
+            *(self._plane.rpc.call(gateway, keyspace.LEARN_UNMASK, ask) for gateway in gateways), return_exceptions=True
+        )
+        found = [share for each in answers if isinstance(each, LearnUnmasked) for share in each.revealed]
+        try:
+            return await asyncio.to_thread(secagg.leftover, cohort, summed, found)
+        except (secagg.MissingSharesError, PayloadError) as error:
+            silent = [each for each in answers if isinstance(each, UnreachableError | DeadlineError)]
+            if silent:
+                raise UnreachableError(f"{error}: {silent[0].message}") from error
+            # All that can answer have: their keys went with a restart, or were used for other updates.
+            refused = next((each.message for each in answers if isinstance(each, SwiftbotError)), str(error))
+            return rounds.TooFew(1, {}, dict.fromkeys(summed, f"the masks cannot be taken off: {refused}"))
+
     # --- aggregation ----------------------------------------------------------------------------------------------
 
     async def _aggregate(self, aggregate: rounds.Aggregate) -> None:
         """Have the updates summed, and the model kept by enough gateways."""
         recipe = self._recipe()
-        params = {
+        params: dict[str, Any] = {
             "run": self._run_id,
             "round": aggregate.number,
             "model": recipe.model,
@@ -842,6 +942,12 @@ class RoundDriver:
             "seed": recipe.seed,
             "report": True,
         }
+        record = self.record()
+        if record is not None and record.cohort is not None:
+            left = await self._leftover_or_failed(aggregate, record.cohort)
+            if left is None:
+                return
+            params["masks"] = [[each.seed.hex(), each.sign] for each in left]
         # Named by what is summed: asked again after a takeover it is the same run, and never that of other updates.
         # After a failure it is another run: gateways answer for one that they know with what became of it.
         name = f"aggregate-{hashlib.sha256(encode(params)).hexdigest()[:12]}"
@@ -862,6 +968,20 @@ class RoundDriver:
             self.put(rounds.AggregateFailed(getattr(error, "message", str(error))[:300]))
             return
         self.put(rounds.Aggregated(model, refused, left_out))
+
+    async def _leftover_or_failed(self, aggregate: rounds.Aggregate, cohort: Cohort) -> list[Seed] | None:
+        """Return the masks to take off a sum; None where there is none, which is told."""
+        try:
+            left = await self._leftover(aggregate, cohort)
+        except Exception as error:  # as in `_aggregate`
+            if not isinstance(error, SwiftbotError):
+                log.exception("taking masks off broke", run=self._run_id, round=self.number)
+            self.put(rounds.AggregateFailed(getattr(error, "message", str(error))[:300]))
+            return None
+        if isinstance(left, rounds.TooFew):
+            self.put(left)
+            return None
+        return left
 
     async def _model_of(self, result: dict[str, Any], aggregate: rounds.Aggregate, owner: str) -> Model:
         manifest = shards.parse_manifest(result["manifest"])

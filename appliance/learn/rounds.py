@@ -20,6 +20,8 @@ monotonic clock and passed in.
 - **Refusals**: an update that is unfit, by what it says or where it is summed, counts for nothing. A client refused
   twice in a row is excluded: when the round closes, or within the round (`Exclude`) where it is ordered again because
   too few are left. Orders and accepted updates carry the number, so that a successor goes on counting.
+- **Secure aggregation**: the clients of a cohort agree on masks (`MakeKeys`) before they are sent their orders. Of them
+  a majority has to answer (`secagg.threshold`); with fewer another cohort agrees on new masks and trains anew.
 - **Closing**: a round that has what it waits for has its updates aggregated. An update that is left out through no
   fault of its client (its files are lost, multi-Krum averages others) does not count either, and excludes nobody. Where
   too few are left for a model, the round goes on: with clients that were not chosen, then with those whose updates were
@@ -38,9 +40,11 @@ from typing import NamedTuple
 from msgspec import Struct, field
 from msgspec.structs import replace
 
+from appliance.learn.secagg import threshold
 from appliance.model.learning import (
     ClientState,
     Closed,
+    Cohort,
     Counted,
     Mode,
     Model,
@@ -141,6 +145,18 @@ class Lost(Struct, frozen=True, tag=True):
     client: str
 
 
+class Keyed(Struct, frozen=True, tag=True):
+    """The clients of a cohort have agreed on masks (`MakeKeys`)."""
+
+    cohort: Cohort
+
+
+class Unkeyed(Struct, frozen=True, tag=True):
+    """They have not."""
+
+    reason: str
+
+
 class Changed(Struct, frozen=True, tag=True):
     """The run's record was changed: paused, resumed, stopped, a client excluded."""
 
@@ -181,7 +197,20 @@ class AggregateFailed(Struct, frozen=True, tag=True):
     reason: str
 
 
-Event = Ordered | Arrived | Failed | Waiting | Present | Lost | Changed | Aggregated | TooFew | AggregateFailed
+Event = (
+    Ordered
+    | Arrived
+    | Failed
+    | Waiting
+    | Present
+    | Lost
+    | Keyed
+    | Unkeyed
+    | Changed
+    | Aggregated
+    | TooFew
+    | AggregateFailed
+)
 
 
 # --- instructions
@@ -191,6 +220,13 @@ class WriteRound(NamedTuple):
     """Write the round's record before what follows."""
 
     record: RoundRecord
+
+
+class MakeKeys(NamedTuple):
+    """Have the clients of a cohort agree on masks, before they are sent their orders; answered by an event."""
+
+    number: int
+    clients: tuple[str, ...]
 
 
 class Send(NamedTuple):
@@ -268,7 +304,7 @@ class Close(NamedTuple):
     result: Result
 
 
-Instruction = WriteRound | Send | Cancel | Ask | Accept | Refuse | Exclude | Aggregate | Close
+Instruction = WriteRound | MakeKeys | Send | Cancel | Ask | Accept | Refuse | Exclude | Aggregate | Close
 
 
 class Patch(NamedTuple):
@@ -428,7 +464,7 @@ def rebased(record: RoundRecord, updates: Iterable[UpdateRecord], base: Model) -
         order if order.given_up else replace(order, attempt=order.attempt + 1, gateway="", ordered_s=0.0)
         for order in last.values()
     )
-    return replace(record, base=base, orders=orders, elapsed_s=0.0, waits="")
+    return replace(record, base=base, orders=orders, elapsed_s=0.0, waits="", cohort=None)
 
 
 # --- the decider
@@ -493,6 +529,11 @@ class Decider:
             self._learn(client)
         self._deadline = record.deadline_s
         self._aggregating = False
+        self._keying = False
+        """Whether the cohort agrees on masks just now."""
+        self._secure = run.recipe.update.secagg
+        if record.cohort is not None:
+            self._least = max(self._least, threshold(len(record.cohort.clients)))
         self._failures = 0
         self._again_at: float | None = None
         self._stuck_at: float | None = None
@@ -547,7 +588,9 @@ class Decider:
 
     def resume(self, now: float) -> list[Instruction]:
         """Begin, perhaps where another coordinator ended: its orders are asked after."""
-        out = [Ask(order) if order.gateway else Send(order) for order in self.orders]
+        out: list[Instruction] = []
+        for order in self.orders:
+            out += [Ask(order)] if order.gateway else self._send([order])
         if self._run.recipe.mode is Mode.OFFLOAD:
             self._offer_again(now)
         return [*out, *self.advance(now)]
@@ -596,6 +639,10 @@ class Decider:
             case Lost():
                 self._present.pop(event.client, None)
                 self._give_up_client(event.client, f"{event.client} is not there")
+            case Keyed():
+                out = self._keyed(event.cohort, now)
+            case Unkeyed():
+                self._unkeyed(event.reason, now)
             case Changed():
                 out = self._changed(event.run, now)
             case Aggregated():
@@ -604,11 +651,14 @@ class Decider:
                 out = self._too_few(event, now)
             case AggregateFailed():
                 self._aggregating = False
-                self._failures += 1
-                pause = min(LONGEST_RETRY_S, RETRY_S * 2 ** (self._failures - 1))
-                self._again_at = now + pause
+                self._put_off(now)
                 self._waits = f"aggregation is tried again: {event.reason}"
         return [*out, *self.advance(now)]
+
+    def _put_off(self, now: float) -> None:
+        """Do nothing for a while, each time for longer."""
+        self._failures += 1
+        self._again_at = now + min(LONGEST_RETRY_S, RETRY_S * 2 ** (self._failures - 1))
 
     def advance(self, now: float) -> list[Instruction]:
         """Do what follows from the state and the time."""
@@ -622,6 +672,8 @@ class Decider:
         out += self._time_out(now)
         out += self._send_again(now)
         out += self._extend(now)
+        if self._secure and self._record.target and self._record.cohort is None:
+            out += self._send(self.orders)
         self._follow_deadline()
         out += self._help(now)
         if self._ready(now) and (refused := self._refuse_other_classes(now)):
@@ -683,7 +735,38 @@ class Decider:
             self._patches[client] = self._patches.get(client, Patch())._replace(chosen=True)
         orders = [order for client in chosen for order in self._work(client, now)]
         self._orders |= {_key(order): order for order in orders}
-        return [*out, WriteRound(self.record(now)), *(Send(order) for order in orders)]
+        return [*out, WriteRound(self.record(now)), *self._send(orders)]
+
+    def _send(self, orders: Iterable[Order]) -> list[Instruction]:
+        """Send orders; those of a cohort that has no masks yet once it has them."""
+        orders = list(orders)
+        if not self._secure or self._record.cohort is not None:
+            return [Send(order) for order in orders]
+        if self._keying or not orders:
+            return []
+        self._keying = True
+        return [MakeKeys(self.number, tuple(sorted({order.client for order in self.orders})))]
+
+    def _keyed(self, cohort: Cohort, now: float) -> list[Instruction]:
+        """The cohort has masks: its orders are sent, and nobody comes to it any more."""
+        if not self._keying:
+            return []
+        self._keying, self._failures = False, 0
+        self._record = replace(self._record, cohort=cohort)
+        self._least = max(self._least, threshold(len(cohort.clients)))
+        known = {each.client for each in cohort.clients}
+        for order in self.orders:
+            if order.client not in known:
+                self._dropped(order, "it has no keys of this round")
+            self._reasons.pop(_key(order), None)
+        return [WriteRound(self.record(now)), *self._send(self.orders)]
+
+    def _unkeyed(self, reason: str, now: float) -> None:
+        if self._keying:
+            self._keying = False
+            self._put_off(now)
+            self._reasons |= {_key(order): f"no masks yet: {reason}"[:200] for order in self.orders}
+            self._waits = self._waiting_for(self._open_of_cohort())
 
     def _take_in_apart(self) -> list[Instruction]:
         """Count what another side of a partition has accepted as late updates: with `sync` no late one counts."""
@@ -778,7 +861,7 @@ class Decider:
             order = replace(self._offered.pop(0), helper=found, ordered_s=round(now - self._opened, 3))
             self._orders[_key(order)] = order
             sent.append(order)
-        return [WriteRound(self.record(now)), *(Send(order) for order in sent)] if sent else []
+        return [WriteRound(self.record(now)), *self._send(sent)] if sent else []
 
     def _helper(self, client: str) -> str | None:
         """The fastest client that has nothing to do and may see another's samples."""
@@ -818,7 +901,7 @@ class Decider:
         self._orders[event.key] = again
         self._reasons[event.key] = event.reason[:200]
         if not event.transient and self._run.state is RunState.RUNNING:
-            return [WriteRound(self.record(now)), Send(again)]
+            return [WriteRound(self.record(now)), *self._send([again])]
         self._pauses[event.key] = self._pauses.get(event.key, 0) + 1
         pause = min(LONGEST_RETRY_S, RETRY_S * 2 ** min(10, self._pauses[event.key] - 1)) if event.transient else 0.0
         self._later[event.key] = now + pause
@@ -829,7 +912,7 @@ class Decider:
         due = sorted(key for key, at in self._later.items() if at <= now)
         for key in due:
             del self._later[key]
-        return [Send(order) for key in due if (order := self.order(key)) is not None and not order.gateway]
+        return self._send(order for key in due if (order := self.order(key)) is not None and not order.gateway)
 
     def _dropped(self, order: Order, reason: str) -> list[Instruction]:
         """An order is not awaited any more."""
@@ -861,7 +944,7 @@ class Decider:
         known = self._clients.get(event.client)
         if not new or self._aggregating or self._run.state is not RunState.RUNNING:
             return []
-        if known is None or known.excluded:
+        if known is None or known.excluded or not self._may_go_on(event):
             return []
         out: list[Instruction] = []
         for key, order in list(self._orders.items()):
@@ -872,8 +955,17 @@ class Decider:
                     order, given_up="", gateway="", attempt=order.attempt + 1, ordered_s=round(now - self._opened, 3)
                 )
                 self._orders[key] = again
-                out.append(Send(again))
+                out += self._send([again])
         return [WriteRound(self.record(now)), *out] if out else []
+
+    def _may_go_on(self, event: Present) -> bool:
+        """Whether a client that is back has its masks: they are at the gateway where it was."""
+        if not self._secure:
+            return True
+        cohort = self._record.cohort
+        return cohort is not None and (event.client, event.gateway) in {
+            (each.client, each.gateway) for each in cohort.clients
+        }
 
     def _extend(self, now: float) -> list[Instruction]:
         """A round that too few of its cohort answer takes others, then tries those that failed again."""
@@ -881,28 +973,62 @@ class Decider:
         if not self._record.target or missing <= 0 or self._open_of_cohort():
             self._stuck_at = None
             return []
+        if self._secure:
+            return self._begin_again(now)
         chosen = self._pick(self._eligible(), missing)
         orders = [order for client in chosen for order in self._work(client, now)]
         for client in chosen:
             self._patches[client] = self._patches.get(client, Patch())._replace(chosen=True)
         if not orders:
-            if self._stuck_at is None:
-                self._stuck += 1
-                self._stuck_at = now + min(LONGEST_RETRY_S, RETRY_S * 2**self._stuck)
-            if now < self._stuck_at:
+            if self._pauses_for(now):
                 return []
-            self._stuck_at = None
-            at = round(now - self._opened, 3)
-            orders = [
-                replace(order, given_up="", gateway="", attempt=order.attempt + 1, ordered_s=at)
-                for order in self._orders.values()
-                if order.client in self._present
-                and not order.part
-                and order.client not in self._parts
-                and not self._clients[order.client].excluded
-            ]
+            orders = self._made_again(now)
         self._orders |= {_key(order): order for order in orders}
-        return [WriteRound(self.record(now)), *(Send(order) for order in orders)] if orders else []
+        return [WriteRound(self.record(now)), *self._send(orders)] if orders else []
+
+    def _pauses_for(self, now: float) -> bool:
+        """Whether a round that nobody answers waits, each time for longer, before those that failed try again."""
+        if self._stuck_at is None:
+            self._stuck += 1
+            self._stuck_at = now + min(LONGEST_RETRY_S, RETRY_S * 2 ** min(10, self._stuck))
+        if now < self._stuck_at:
+            return True
+        self._stuck_at = None
+        return False
+
+    def _made_again(self, now: float) -> list[Order]:
+        """The orders of the round whose clients do not count, once more."""
+        at = round(now - self._opened, 3)
+        return [
+            replace(order, given_up="", gateway="", attempt=order.attempt + 1, ordered_s=at)
+            for order in self._orders.values()
+            if order.client in self._present
+            and not order.part
+            and order.client not in self._parts
+            and not self._clients[order.client].excluded
+        ]
+
+    def _begin_again(self, now: float) -> list[Instruction]:
+        """A cohort of which too few are left: masks cancel for its own clients only, so another one trains anew."""
+        if self._pauses_for(now):
+            return []
+        out: list[Instruction] = []
+        for client, parts in sorted(self._parts.items()):
+            own = parts[0]
+            self._orders[(client, self.number, 0)] = Order(
+                client=client, round=self.number, attempt=own.attempt, refused=own.refused, given_up="too few were left"
+            )
+            out.append(Accept(self.number, UpdateRecord(client=client)))
+        self._parts.clear()
+        chosen = self._pick(self._eligible(), max(0, self._record.target - len(self._orders)))
+        for client in chosen:
+            self._patches[client] = self._patches.get(client, Patch())._replace(chosen=True)
+        orders = [*self._made_again(now), *(order for client in chosen for order in self._work(client, now))]
+        self._orders |= {_key(order): order for order in orders}
+        self._record = replace(self._record, cohort=None)
+        self._keying = False
+        self._least = self._run.recipe.rounds.at_least
+        return [*out, WriteRound(self.record(now)), *self._send(orders)]
 
     def _fits(self, order: Order, now: float) -> bool:
         """Whether a client that comes back can finish before the round closes without it."""
@@ -1108,7 +1234,7 @@ class Decider:
         parts = self._parts[client]
         samples = sum(part.samples for part in parts.values())
         staleness = self.number - min(part.round for part in parts.values())
-        weight = stale_weight(samples, staleness)
+        weight = samples if self._secure else stale_weight(samples, staleness)
         done = sum(part.steps for part in parts.values())
         share = sum(_length(part.share) for part in parts.values())
         whole = round(sum(part.steps_whole for part in parts.values()) / max(0.01, share))
@@ -1229,6 +1355,8 @@ def _problem(update: PartialUpdate, run: RunRecord) -> str:
         return f"{update.samples:,} samples, the data set has {run.most_samples:,}"
     if run.classes and update.classes not in ((), run.classes):
         return other_classes(update.classes, run.classes)
+    if run.recipe.update.secagg != (update.coding == "masked"):
+        return "it is not masked" if run.recipe.update.secagg else "it is masked"
     if not 0 < update.steps <= update.steps_whole:
         return f"{update.steps} steps of {update.steps_whole}"
     if update.loss is not None and not math.isfinite(update.loss):

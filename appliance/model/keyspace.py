@@ -1122,6 +1122,37 @@ LEARN_EXPORT = Verb(
     asks=STEERING,
     signed=True,
 )
+LEARN_KEYS = Verb(
+    "learn_keys",
+    learn_api.LearnKeysAsk,
+    learn_api.LearnKeys,
+    "secure aggregation: make keys for clients of this gateway; private ones stay in its memory",
+    asks=GATEWAYS,
+)
+LEARN_SHARE = Verb(
+    "learn_share",
+    learn_api.LearnShareAsk,
+    learn_api.LearnShares,
+    "secure aggregation: shares of the secrets of this gateway's clients, each encrypted for one of the cohort",
+    timeout_s=30.0,
+    asks=GATEWAYS,
+)
+LEARN_HOLD = Verb(
+    "learn_hold",
+    learn_api.LearnHoldAsk,
+    learn_api.LearnHeld,
+    "secure aggregation: the cohort, and the shares of others for this gateway's clients to hold",
+    timeout_s=30.0,
+    asks=GATEWAYS,
+)
+LEARN_UNMASK = Verb(
+    "learn_unmask",
+    learn_api.LearnUnmaskAsk,
+    learn_api.LearnUnmasked,
+    "secure aggregation: the shares that the sum of some clients' updates needs, given for one set of clients only",
+    timeout_s=30.0,
+    asks=GATEWAYS,
+)
 
 # --- Robots
 SOFT_STOP = Verb(

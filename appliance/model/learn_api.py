@@ -5,7 +5,17 @@ from typing import Literal
 from msgspec import Struct
 
 from appliance.model import Signed
-from appliance.model.learning import ClientState, ClientStatus, Order, Recipe, Reference, RoundRecord, RunRecord
+from appliance.model.learning import (
+    ClientState,
+    ClientStatus,
+    Cohort,
+    Order,
+    PublicKeys,
+    Recipe,
+    Reference,
+    RoundRecord,
+    RunRecord,
+)
 
 Steering = Literal["pause", "resume", "stop", "exclude", "include", "mark", "unmark", "remove"]
 
@@ -143,3 +153,73 @@ class LearnExported(Struct, frozen=True, kw_only=True):
     model: int
     file: Reference
     checks: Reference
+
+
+# --- secure aggregation (`learn.secagg`)
+
+
+class Sealed(Struct, frozen=True, kw_only=True):
+    """A client's shares of its two secrets for another client, encrypted for that one; hex."""
+
+    of: str
+    to: str
+    data: str
+
+
+class Revealed(Struct, frozen=True, kw_only=True):
+    """A share that is given away, in hex: of a client that is summed of its own mask, of another of its mask key."""
+
+    of: str
+    x: int
+    y: str
+
+
+class LearnKeysAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`learn_keys`: make keys for clients of the asked gateway."""
+
+    epoch: str
+    clients: tuple[str, ...]
+
+
+class LearnKeys(Struct, frozen=True, kw_only=True):
+    """Their public keys."""
+
+    keys: tuple[PublicKeys, ...]
+
+
+class LearnShareAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`learn_share`: cut the secrets of the asked gateway's clients for a cohort."""
+
+    cohort: Cohort
+
+
+class LearnShares(Struct, frozen=True, kw_only=True):
+    """The shares, each encrypted for one client."""
+
+    sealed: tuple[Sealed, ...]
+
+
+class LearnHoldAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`learn_hold`: this is the cohort, these are the shares of others for the asked gateway's clients."""
+
+    cohort: Cohort
+    sealed: tuple[Sealed, ...]
+
+
+class LearnHeld(Struct, frozen=True, kw_only=True):
+    """How many clients of the cohort are at the asked gateway."""
+
+    clients: int
+
+
+class LearnUnmaskAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`learn_unmask`: give away the shares that the sum of these clients' updates needs."""
+
+    epoch: str
+    summed: tuple[str, ...]
+
+
+class LearnUnmasked(Struct, frozen=True, kw_only=True):
+    """The shares that the asked gateway's clients hold."""
+
+    revealed: tuple[Revealed, ...]

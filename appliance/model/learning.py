@@ -74,7 +74,7 @@ class Mode(OpenEnum):
     """When a round closes, and what becomes of slow clients."""
 
     AUTO = "auto"
-    """`offload` where `data.share` allows it, else `partial`."""
+    """`offload` where `data.share` allows it, else `partial`; with secure aggregation `sync`."""
     SYNC = "sync"
     """Waits for all (FedAvg)."""
     BUFFERED = "buffered"
@@ -112,6 +112,8 @@ class Update(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkno
     """`mean`, `median`, `trimmed:SHARE` or `multikrum:HOSTILE`."""
     compression: Literal["none", "int8"] = "none"
     """How clients send their updates: as they are, or in 8 bits, with what that rounds off added to the next one."""
+    secagg: bool = False
+    """Secure aggregation: clients mask their updates, only the sum can be read. With mode `sync` and robots."""
 
 
 class Evaluation(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
@@ -154,6 +156,8 @@ class Recipe(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkno
         """The mode in force."""
         if self.rounds.mode is not Mode.AUTO:
             return self.rounds.mode
+        if self.update.secagg:
+            return Mode.SYNC
         return Mode.PARTIAL if self.data.share == "never" else Mode.OFFLOAD
 
     @property
@@ -320,7 +324,7 @@ class PartialUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
     gateway: str = ""
     manifest: Reference = field(default_factory=dict[str, Any])
     shards: tuple[Reference, ...] = ()
-    coding: Literal["none", "int8"] = "none"
+    coding: Literal["none", "int8", "masked"] = "none"
     residual: tuple[Reference, ...] = ()
     """What coding left over of it."""
     samples: int = 0
@@ -360,6 +364,25 @@ class Counted(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Why its update did not count: it is unfit, or was left out."""
 
 
+class PublicKeys(Struct, frozen=True, kw_only=True):
+    """A client of a cohort with secure aggregation: the gateway that has its secrets, and its public keys in hex."""
+
+    client: str
+    gateway: str
+    sharing: str
+    """For shares of secrets."""
+    masking: str
+    """For the masks that it has in common with others."""
+
+
+class Cohort(Struct, frozen=True, kw_only=True):
+    """The clients whose masks cancel in a sum."""
+
+    epoch: str
+    """Names their keys; drawn for each cohort."""
+    clients: tuple[PublicKeys, ...]
+
+
 class Side(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How one side of a partition has closed a round."""
 
@@ -377,6 +400,8 @@ class RoundRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The cohort's, parts for helpers, and those of rounds before that are still awaited."""
     target: int = 0
     """Clients that it waits for; 0: the cohort is not chosen yet."""
+    cohort: Cohort | None = None
+    """With secure aggregation, once its clients have keys."""
     elapsed_s: float = 0.0
     """Since it opened, when this was written."""
     deadline_s: float | None = None

@@ -9,7 +9,7 @@ import asyncio
 import base64
 import re
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, cast
 
 import msgspec
@@ -33,6 +33,7 @@ from appliance.tasks.records import MAX_RUN_S, clean, task_key
 log = structlog.get_logger(__name__)
 
 Orders = Callable[[str, RobotCommand, frozenset[str], bool], RobotCommand]
+Offer = Callable[[Call], Awaitable[dict[str, Any]]]
 
 _NOT_A_NAME = re.compile(r"[^a-z0-9_.-]")
 HEARD_S = 0.5
@@ -78,6 +79,11 @@ class Calls:
         self._artifacts = artifacts
         self._copies = copies
         self._on_wait = on_wait
+        self._offered: dict[str, Offer] = {}
+
+    def offer(self, name: str, answer: Offer) -> None:
+        """Have another part of the gateway answer calls of a name."""
+        self._offered[name] = answer
 
     async def __call__(self, call: Call) -> dict[str, Any]:
         """Carry out one call and return its answer; a SwiftbotError is the handler's to see."""
@@ -92,6 +98,8 @@ class Calls:
                 return await self._put(call)
             case "get_artifact":
                 return await self._get(call)
+            case _ if (offer := self._offered.get(call.name)) is not None:
+                return await offer(call)
             case _:
                 raise PayloadError(f"a handler asked for {call.name[:40]!r}, which the appliance does not offer")
 

@@ -19,11 +19,14 @@ from msgspec.structs import replace
 
 from appliance.learn import rounds
 from appliance.learn.rounds import Decider, Event, Instruction, Key
+from appliance.learn.secagg import threshold
 from appliance.model.learning import (
     ClientState,
+    Cohort,
     Model,
     Order,
     PartialUpdate,
+    PublicKeys,
     Recipe,
     RoundRecord,
     RunRecord,
@@ -127,7 +130,7 @@ class Simulation:
         """Order and attempt -> when it ends, and what its gateway tells of its end from then on."""
         self._begun: set[tuple[Key, int]] = set()
         self._accepted: set[Key] = set()
-        self._models = 0
+        self._models = self._epochs = 0
         self._idle = 0
         """How often in a row the decider looked again and wanted nothing."""
         self._took: list[float] = []
@@ -206,6 +209,8 @@ class Simulation:
             match instruction:
                 case rounds.WriteRound():
                     self._round = instruction.record
+                case rounds.MakeKeys():
+                    self._make_keys(instruction)
                 case rounds.Send():
                     self._send(instruction.order)
                 case rounds.Ask():
@@ -223,7 +228,18 @@ class Simulation:
                 case rounds.Refuse():
                     pass
 
+    def _make_keys(self, make: rounds.MakeKeys) -> None:
+        if self._happens(self._faults.transient):
+            self._push(self._now, rounds.Unkeyed("a gateway does not answer"))
+            return
+        self._epochs += 1
+        keyed = [client for client in make.clients if not self._happens(self._faults.lost)] or list(make.clients)
+        keys = (PublicKeys(client=client, gateway="gw", sharing="", masking="") for client in keyed)
+        self._push(self._now, rounds.Keyed(Cohort(epoch=str(self._epochs), clients=tuple(keys))))
+
     def _send(self, order: Order) -> None:
+        if self._run.recipe.update.secagg and order.client not in self._masked():
+            raise InvariantError(f"{order.client} is to train without masks")
         run = ((order.client, order.round, order.part), order.attempt)
         if run in self._begun:
             return  # the same order again is the same run
@@ -279,6 +295,7 @@ class Simulation:
             steps_whole=steps,
             loss=1.0,
             took_s=took,
+            coding="masked" if self._run.recipe.update.secagg else "none",
         )
         return took, update
 
@@ -330,12 +347,25 @@ class Simulation:
         accepted = {(part.client, part.round, part.part) for each in self._updates.values() for part in each.parts}
         if not summed <= accepted:
             raise InvariantError(f"round {aggregate.number} sums what was not accepted")
+        if self._run.recipe.update.secagg:
+            self._check_cohort({share.update.client for share in aggregate.shares})
         if any(share.weight < 1 or share.scale[0] < 1 or share.scale[1] < 1 for share in aggregate.shares):
             raise InvariantError(f"round {aggregate.number} has a weight or scale of nothing")
         if self._happens(self._faults.aggregation):
             self._push(self._now, rounds.AggregateFailed("it failed"))
             return
         self._push(self._now, self._made(aggregate))
+
+    def _masked(self) -> set[str]:
+        """The clients that have masks."""
+        cohort = self._round.cohort
+        return {each.client for each in cohort.clients} if cohort is not None else set[str]()
+
+    def _check_cohort(self, summed: set[str]) -> None:
+        """Masks cancel among the clients of one cohort, of which a majority answers."""
+        clients = self._masked()
+        if not summed <= clients or len(summed) < threshold(len(clients)):
+            raise InvariantError(f"{len(summed)} of a cohort of {len(clients)} are summed, or others")
 
     # --- what those put in the place of who train
 

@@ -128,6 +128,13 @@ class Context(Surroundings):
         args = {"question": question, "choices": list(choices), "to": to, "timeout_s": timeout_s}
         return str(self._dict(self._link.ask("ask", args)).get("answer", ""))
 
+    def request(self, name: str, **args: Any) -> dict[str, Any]:
+        """Ask a part of the gateway that offers something to skills that come with it; CallError where there is none.
+
+        `masks` {epoch}: of a client with secure aggregation.
+        """
+        return self._dict(self._link.ask(name, args))
+
     def put_artifact(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> dict[str, Any]:
         """Keep a file and return a reference to it, fit for a result; CallError when it is longer than 11 MiB."""
         if len(data) > MAX_ARTIFACT:

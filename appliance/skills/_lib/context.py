@@ -57,6 +57,10 @@ class Context(Surroundings, Protocol):
         """Ask people and return the answer, one of `choices` where there are any."""
         ...
 
+    def request(self, name: str, **args: Any) -> dict[str, Any]:
+        """Ask a part of the gateway that offers something to skills that come with it."""
+        ...
+
     def put_artifact(self, name: str, data: bytes, media_type: str = ...) -> dict[str, Any]:
         """Keep a file, return a reference to it."""
         ...

@@ -1,13 +1,14 @@
 """aggregate: many clients' updates into one new model; `_lib.learning.aggregation` does it, shard by shard."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from _lib import params
 from _lib.context import Context
-from _lib.learning import aggregation, models, orders, shards, work
+from _lib.learning import aggregation, masks, models, orders, shards, work
 from _lib.learning.aggregation import Aggregator, File, TooFewError, Update, Verdict
+from _lib.learning.masks import Masked, Seed
 from _lib.learning.orders import Aggregation, OrderError
 from _lib.learning.shards import ModelFileError, Piece, Spec
 
@@ -23,9 +24,11 @@ def run(ctx: Context) -> dict[str, Any]:
     except OrderError as error:
         raise work.refused(ctx, error) from error
     model = work.model_of(ctx, order.model)
+    if order.masks is not None:
+        return _unmasked(ctx, order, model, order.masks)
     refused: dict[str, Verdict] = {}
     updates = _updates(ctx, order, refused)
-    classes = order.classes or _classes(updates, model)
+    classes = order.classes or _classes([file.manifest for each in updates for file in each.files], model)
     pieces = shards.layout(Spec(each.name, "F32", each.shape) for each in model.tensors(classes))
     references: dict[int, dict[str, Any]] = {}
 
@@ -56,6 +59,49 @@ def run(ctx: Context) -> dict[str, Any]:
         "weight": result.weight,
         "bound": result.bound,
     }
+
+
+def _unmasked(ctx: Context, order: Aggregation, model: work.Model, seeds: Sequence[Seed]) -> dict[str, Any]:
+    """Return the new model of masked updates, of which nothing but their sum can be read.
+
+    Where it cannot be made of all of them, what was summed is not known to anybody: with `report` that is a result,
+    with a verdict on the client whose file is wrong, or, where masks do not cancel, on all.
+    """
+    updates: list[Masked] = []
+    unreadable: dict[str, Verdict] = {}
+    for each in order.updates:
+        try:
+            manifest = work.manifest_of(ctx, each.manifest)
+            work.check_count(manifest, each.shards)
+            fetch = partial(work.fetch_shard, ctx, manifest, each.shards)
+            updates.append(Masked(each.client, manifest, fetch, each.weight))
+        except ModelFileError as error:
+            unreadable[each.client] = Verdict(accepted=False, reason=error.reason, message=str(error))
+    classes = order.classes or _classes([each.manifest for each in updates], model)
+    tensors = model.tensors(classes)
+    try:
+        if unreadable:
+            raise TooFewError("an update cannot be read", 1, unreadable)
+        layout = shards.layout(Spec(each.name, "I64", each.shape) for each in tensors)
+        changes = masks.mean(updates, layout, seeds)
+    except masks.UnreadableError as error:
+        verdict = Verdict(accepted=False, reason=error.reason, message=str(error))
+        return _too_few(ctx, order, TooFewError(str(error), 1, {error.client: verdict}))
+    except ValueError as error:
+        told = {each.client: Verdict(accepted=False, reason="lost", message=str(error)) for each in order.updates}
+        return _too_few(ctx, order, error if isinstance(error, TooFewError) else TooFewError(str(error), 1, told))
+    base = work.base_values(ctx, order.base, tensors, order.seed)
+    values = {name: base[name] + changes.pop(name) for name in sorted(base)}
+    manifest, references = work.keep(ctx, values, "model")
+    verdicts = _told({each.client: Verdict(accepted=True) for each in updates})
+    made = {"manifest": manifest, "shards": references}
+    return {"model": made, **made, "verdicts": verdicts, "weight": sum(each.weight for each in updates)}
+
+
+def _too_few(ctx: Context, order: Aggregation, error: TooFewError) -> dict[str, Any]:
+    if not order.report:
+        raise _refusal(ctx, error, {})
+    return {"needed": error.needed, "verdicts": _told(error.verdicts)}
 
 
 def _told(verdicts: Mapping[str, Verdict]) -> dict[str, dict[str, Any]]:
@@ -114,7 +160,7 @@ def _updates(ctx: Context, order: Aggregation, refused: dict[str, Verdict]) -> l
     return [each for each in found.values() if each.client not in refused]
 
 
-def _classes(updates: list[Update], model: work.Model) -> int:
+def _classes(manifests: Sequence[shards.Manifest], model: work.Model) -> int:
     """Return how many classes the model has: as most updates say."""
     symbolic = [(name, shape.index("classes")) for name, shape in model.shapes if "classes" in shape]
     if not symbolic:
@@ -122,9 +168,8 @@ def _classes(updates: list[Update], model: work.Model) -> int:
     name, axis = symbolic[0]
     votes = [
         spec.shape[axis]
-        for update in updates
-        for file in update.files
-        for spec in shards.specs(file.manifest)
+        for manifest in manifests
+        for spec in shards.specs(manifest)
         if spec.name == name and len(spec.shape) > axis
     ]
     return max(set(votes), key=lambda vote: (votes.count(vote), -vote)) if votes else len(model.classes)

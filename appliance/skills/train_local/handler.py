@@ -11,6 +11,7 @@ from typing import Any
 from _lib.context import Context, Surroundings
 from _lib.learning import orders, training, work
 from _lib.learning.decoders import CorruptFileError
+from _lib.learning.masks import Seed, masked, read_seeds
 from _lib.learning.models import Tensor
 from _lib.learning.orders import OrderError
 from _lib.learning.training import AfterStep, Outcome, Plan, Samples, State
@@ -31,6 +32,7 @@ def run(ctx: Context) -> dict[str, Any]:
     """Return the update (shards, manifest), samples, steps, steps_of_epoch, loss, train_s, first_step_s, classes.
 
     Of an update in 8 bits (`coding`) also the files of what coding left over (`residual`), for the client's next one.
+    With `secure` the update is masked, and no checkpoint is kept.
     """
     began = time.monotonic()
     try:
@@ -42,6 +44,8 @@ def run(ctx: Context) -> dict[str, Any]:
     held = work.share(ctx, model, order.data, order.part, run_seed=order.seed)
     tensors = model.tensors(len(held.classes))
     base = work.base_values(ctx, order.base, tensors, order.seed)
+    # Before anything is trained: a client without masks takes no part.
+    seeds = read_seeds(ctx.request("masks", epoch=order.secure)["masks"]) if order.secure else ()
     try:
         module = training.build(model, len(held.classes))
     except ValueError as error:
@@ -74,7 +78,7 @@ def run(ctx: Context) -> dict[str, Any]:
         raise ctx.Fail(f"a file was damaged during training: {error}", "copy the data again", retryable=True) from error
     delta = {name: done.values[name] - base[name] for name in base}
     try:
-        update = _keep(ctx, order, delta, tensors, done)
+        update = _keep_masked(ctx, order, delta, held, seeds) if seeds else _keep(ctx, order, delta, tensors, done)
     except work.ModelFileError as error:
         raise ctx.Fail(f"training diverged: {error}", "take a lower learning rate") from error
     return _result(done, update, held, began) | _notes(module, done)
@@ -110,6 +114,15 @@ def _keep(
     return {"manifest": coded.manifest, "shards": coded.shards, "coding": "int8", "residual": coded.residual}
 
 
+def _keep_masked(
+    ctx: Context, order: orders.Training, delta: dict[str, work.Floats], held: work.Share, seeds: Sequence[Seed]
+) -> dict[str, Any]:
+    """Keep the update as artifacts with its masks on; without them it never leaves this process."""
+    values = masked(delta, len(held.arrays), seeds)
+    manifest, references = work.keep(ctx, values, f"update-{order.round}", masked=True)
+    return {"manifest": manifest, "shards": references, "coding": "masked"}
+
+
 def _notes(module: Any, done: Outcome) -> dict[str, Any]:
     notes: list[str] = []
     if kept := training.running_statistics(module):
@@ -122,7 +135,7 @@ def _notes(module: Any, done: Outcome) -> dict[str, Any]:
 def _resume(ctx: Context, order: orders.Training) -> State | None:
     """Return where an earlier attempt of the same round stood, if it kept that."""
     kept = ctx.resume
-    if kept is None or kept.get("base") != _base_key(order):
+    if order.secure or kept is None or kept.get("base") != _base_key(order):
         return None
     try:
         manifest = work.manifest_of(ctx, kept["manifest"])
@@ -155,6 +168,8 @@ def _follow(ctx: Context, order: orders.Training, batch: int) -> AfterStep:
             last_told = now
             rate = (step - first) * batch / max(1e-6, now - began)
             ctx.progress(step / total, f"step {step}/{total}, loss {loss_sum / step:.3f}, {rate:.0f} samples/s")
+        if order.secure:  # a checkpoint would be the update without its masks
+            return
         if step < total and (ctx.checkpoint_due() or (order.every_steps and step % order.every_steps == 0)):
             manifest, references = work.keep(ctx, values(), f"checkpoint-{order.round}-{step}")
             kept = {"step": step, "loss_sum": loss_sum, "manifest": manifest, "shards": references}

@@ -10,6 +10,7 @@ from appliance.learn import recipe
 from appliance.model.learn_api import DataFound
 from appliance.model.learning import Mode
 
+MASKED = 'model = "clips"\n[clients]\nrobots = ["a", "b", "c", "d", "e", "f", "g"]\n[update]\nsecagg = true\n'
 PLAIN = 'model = "clips"\n[clients]\npartitions = 8\n'
 
 
@@ -82,6 +83,15 @@ def test_a_recipe_is_found_by_name_or_path(tmp_path: Path) -> None:
         (PLAIN + "[emulation]\nnominal_batch_s = 0.1\nspeeds = {part-009 = 5.0}", "emulation.speeds"),
         (PLAIN + "[emulation]\nspeeds = {part-001 = 5.0}", "emulation.nominal_batch_s"),
         (PLAIN + "[privacy]\nsecagg = true", "privacy"),
+        (PLAIN + "[update]\nsecagg = true", "update.secagg: with partitions"),
+        (MASKED + 'rule = "median"', "update.rule: median compares updates"),
+        (MASKED + 'rule = "multikrum:1"', "update.rule"),
+        (MASKED + 'compression = "int8"', "update.compression"),
+        (MASKED + '[rounds]\nmode = "buffered"', "rounds.mode: buffered with update.secagg"),
+        (MASKED + '[rounds]\nmode = "partial"', "rounds.mode: partial with update.secagg"),
+        (MASKED + "[training]\ncheckpoint_steps = 5", "training.checkpoint_steps"),
+        (MASKED.replace("clients]", "clients]\nper_round = 2"), "update.secagg: with 2 clients a round"),
+        (MASKED.replace("clients]", "clients]\nper_round = 3\nover_selection = 3"), "clients.over_selection"),
         (PLAIN + '[data]\nfolder = "{robot}/clips"', "data: {robot}"),
         (
             'model = "clips"\n[clients]\nrobots = ["a"]\n[data]\nfolder = "{robot}/clips"\n',
@@ -148,3 +158,20 @@ def test_class_lists_that_differ_between_clients_are_refused() -> None:
     with pytest.raises(ConfigError, match="in another order"):
         recipe.check_data(made, {("gw-1", "clips"): found(), ("gw-2", "clips"): found(classes=("Walk", "Run"))})
     assert recipe.check_data(made, {("gw-1", "clips"): found(items=30), ("gw-2", "clips"): found()}) == 40
+
+
+def test_of_secure_aggregation_the_fleet_decides_too() -> None:
+    """Sums that may not fit, data of unknown size, a gateway with a majority of the robots: refused at the start."""
+    made = recipe.parse(MASKED, "r.toml")
+    assert made.mode is Mode.SYNC
+    spread = {robot: f"gw-{number % 3}" for number, robot in enumerate(made.clients.robots)}
+    recipe.check_secure(made, spread, 9000)
+    for places, most, told in (
+        (spread, 0, "how many samples clients have is not known"),
+        (spread, 1 << 30, "62 are there"),
+        (dict.fromkeys(spread, "gw-1") | {"a": "gw-2"}, 9000, "6 of 7 clients are at gw-1"),
+        ({"a": "gw-1", "b": "gw-2"}, 9000, "at least 3"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            recipe.check_secure(made, places, most)
+    recipe.check_secure(recipe.parse(PLAIN, "r.toml"), {}, 0)

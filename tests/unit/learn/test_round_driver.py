@@ -12,7 +12,7 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, UnreachableError
-from appliance.learn import records, round_driver, rounds
+from appliance.learn import records, round_driver, rounds, secagg
 from appliance.learn.round_driver import RoundDriver, Site, SupersededError
 from appliance.model import (
     Failure,
@@ -25,10 +25,21 @@ from appliance.model import (
     encode,
     keyspace,
 )
+from appliance.model.learn_api import (
+    LearnHeld,
+    LearnHoldAsk,
+    LearnKeys,
+    LearnKeysAsk,
+    LearnShareAsk,
+    LearnShares,
+    LearnUnmaskAsk,
+    LearnUnmasked,
+)
 from appliance.model.learning import (
     Clients,
     ClientState,
     Closed,
+    Cohort,
     Counted,
     Data,
     Mode,
@@ -546,3 +557,109 @@ async def test_to_stand_in_line_in_vain_uses_up_no_attempt(took_ms: float | None
     if not attempts:
         assert "part-000 (gw-1: no container came free within 30 s)" in record.waits
         assert {each.why for each in fleet.driver.clients()} == {"gw-1: no container came free within 30 s"}
+
+
+class Secure(Fleet):
+    """A fleet of three gateways with a robot each, whose updates are masked. `silent`: gateways that do not answer."""
+
+    def __init__(self, **more: Any) -> None:
+        names = ("gw-1", "gw-2", "gw-3")
+        self.holders = {name: secagg.Holder(name) for name in names}
+        self.silent: set[str] = set()
+        self.unmasked: list[tuple[str, ...]] = []
+        robots = tuple(f"r{number}" for number in range(1, 4))
+        recipe = Recipe(model="clips", clients=Clients(robots=robots), update=Update(secagg=True))
+        run = replace(RUN, recipe=recipe, clients=tuple(ClientState(name=name) for name in robots))
+        super().__init__(run, present=dict(zip(robots, names, strict=True)), answers=self._train, **more)
+
+    def members(self) -> frozenset[str]:
+        """Return the three gateways."""
+        return frozenset(self.holders)
+
+    @staticmethod
+    def _train(request: RunRequest) -> RunEvent:
+        event = trained(request)
+        return replace(event, result={**(event.result or {}), "coding": "masked"})
+
+    async def call(self, gateway: str, verb: object, ask: Any, **more: object) -> Any:
+        """Answer for the keys of clients too."""
+        holder = self.holders[gateway]
+        if gateway in self.silent and verb not in (keyspace.RUN, keyspace.RUN_CANCEL):
+            raise UnreachableError(f"{gateway} does not answer")
+        match ask:
+            case LearnKeysAsk():
+                return LearnKeys(keys=holder.advertise(ask.epoch, ask.clients))
+            case LearnShareAsk():
+                return LearnShares(sealed=holder.share(ask.cohort))
+            case LearnHoldAsk():
+                return LearnHeld(clients=holder.hold(ask.cohort, ask.sealed))
+            case LearnUnmaskAsk():
+                self.unmasked.append(ask.summed)
+                return LearnUnmasked(revealed=holder.unmask(ask.epoch, ask.summed))
+            case _:
+                return await super().call(gateway, verb, ask, **more)
+
+    def sums(self) -> list[RunRequest]:
+        """The aggregations that were asked for."""
+        return [request for request in self.asked if request.skill == round_driver.AGGREGATE]
+
+
+async def test_clients_are_ordered_with_masks_and_the_sum_is_asked_for_without() -> None:
+    """Each order names the cohort's masks, which gateways have; what is left of them goes with the aggregation."""
+    fleet = Secure()
+    driving = asyncio.create_task(fleet.driver.drive())
+    await until(lambda: bool(fleet.sums()))
+    driving.cancel()
+    cohort = fleet.round().cohort
+    assert cohort is not None
+    orders = [request for request in fleet.asked if request.skill == round_driver.TRAIN]
+    assert {request.params["secure"] for request in orders} == {cohort.epoch}
+    assert [each.gateway for each in cohort.clients] == ["gw-1", "gw-2", "gw-3"]
+    asked = fleet.sums()[0].params
+    assert [each[1] for each in asked["masks"]] == [1, 1, 1]
+    assert {each["coding"] for each in asked["updates"]} == {"masked"}
+    assert [each["weight"] for each in asked["updates"]] == [9, 9, 9]
+
+
+async def test_without_enough_shares_a_round_waits_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of three gateways are out of reach when masks are to be taken off: tried again, until they answer."""
+    monkeypatch.setattr(rounds, "RETRY_S", 0.05)
+    fleet = Secure()
+    back: list[bool] = []
+
+    def heard(event: RunEvent, heard: Callable[[RunEvent], None] = fleet.driver.heard) -> None:
+        fleet.silent = set() if back else {"gw-2", "gw-3"}
+        heard(event)
+
+    monkeypatch.setattr(fleet.driver, "heard", heard)
+    driving = asyncio.create_task(fleet.driver.drive())
+    reason = "aggregation is tried again: 1 of 2 shares of r1: gw-2 does not answer"
+    await until(lambda: (record := fleet.driver.record()) is not None and record.waits == reason)
+    assert not fleet.sums()
+    back.append(True)
+    fleet.silent.clear()
+    await until(lambda: bool(fleet.sums()))
+    driving.cancel()
+
+
+async def test_where_keys_are_lost_the_clients_train_anew_with_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of three gateways restarted before masks were taken off: what came is dropped, and another cohort agrees."""
+    monkeypatch.setattr(rounds, "RETRY_S", 0.01)
+    fleet = Secure()
+    first: list[Cohort] = []
+
+    def heard(event: RunEvent, heard: Callable[[RunEvent], None] = fleet.driver.heard) -> None:
+        if not first and (cohort := fleet.round().cohort) is not None:
+            first.append(cohort)
+            fleet.holders |= {name: secagg.Holder(name) for name in ("gw-2", "gw-3")}
+        heard(event)
+
+    monkeypatch.setattr(fleet.driver, "heard", heard)
+    driving = asyncio.create_task(fleet.driver.drive())
+    await until(lambda: bool(fleet.sums()))
+    driving.cancel()
+    second = fleet.round().cohort
+    assert second is not None
+    assert first[0].epoch != second.epoch
+    orders = [request for request in fleet.asked if request.skill == round_driver.TRAIN]
+    assert {request.attempt for request in orders if request.params["secure"] == second.epoch} == {2}

@@ -13,16 +13,19 @@ from appliance.learn.rounds import Decider
 from appliance.model.learning import (
     Clients,
     ClientState,
+    Cohort,
     Data,
     Mode,
     Model,
     Order,
     PartialUpdate,
+    PublicKeys,
     Recipe,
     RoundRecord,
     Rounds,
     RunRecord,
     RunState,
+    Update,
     UpdateRecord,
 )
 from workshop.simulators.learning import Device, Faults, Simulation
@@ -713,3 +716,68 @@ def test_what_coding_left_over_of_an_update_goes_with_the_client_only_if_it_coun
         ((old,), 7, 0),
     ]
     assert after.history[-1].sent_bytes == 50
+
+
+@given(faults(), st.integers(0, 2**20), st.integers(3, 9))
+@settings(deadline=None, max_examples=60)
+def test_masked_updates_are_summed_with_a_majority_of_their_cohort_only(
+    wrong: Faults, seeded: int, clients: int
+) -> None:
+    """Clients without keys, dropouts, lost files, takeovers: nobody trains without masks, and each round ends."""
+    wrong = replace(wrong, refused=0.0) if clients < 6 else wrong
+    made = replace(recipe(Mode.SYNC, clients=clients, count=4), update=Update(secagg=True))
+    outcome = Simulation(made, devices(clients), faults=wrong, seed_number=seeded).play(most_events=20_000)
+    assert outcome.run.state is RunState.SUCCEEDED
+    assert outcome.late == 0
+
+
+def keyed(made: Recipe) -> tuple[Decider, tuple[str, ...]]:
+    """A decider whose cohort has masks, and its clients."""
+    decider, _, out = started(made)
+    make = next(each for each in out if isinstance(each, rounds.MakeKeys))
+    keys = tuple(PublicKeys(client=name, gateway="gw", sharing="", masking="") for name in make.clients)
+    out = decider.handle(rounds.Keyed(Cohort(epoch="e", clients=keys)), 100.0)
+    assert isinstance(out[0], rounds.WriteRound)
+    assert [each.order.client for each in out if isinstance(each, rounds.Send)] == list(make.clients)
+    return decider, make.clients
+
+
+def test_a_cohort_agrees_on_masks_before_it_trains() -> None:
+    """No order is sent before; where keys cannot be made that is tried again, and the round says why."""
+    made = replace(recipe(Mode.SYNC), update=Update(secagg=True))
+    decider, _, out = started(made)
+    assert not any(isinstance(each, rounds.Send) for each in out)
+    assert [each.clients for each in out if isinstance(each, rounds.MakeKeys)] == [made.names]
+    assert decider.handle(rounds.Unkeyed("gw-2 does not answer"), 100.0) == []
+    assert "part-000 (no masks yet: gw-2 does not answer)" in decider.waits
+    at = decider.next_at(100.0)
+    assert at is not None
+    assert [type(each) for each in decider.advance(at)] == [rounds.MakeKeys]
+
+
+def test_with_fewer_than_a_majority_another_cohort_trains_anew() -> None:
+    """Of eight clients five are needed; with four the round begins again, with new masks and nothing of the old."""
+    decider, names = keyed(replace(recipe(Mode.SYNC), update=Update(secagg=True)))
+    for name in names[:4]:
+        decider.handle(rounds.Arrived("r", update(name, coding="masked")), 101.0)
+    for name in names[4:]:
+        for attempt in range(1, 4):
+            decider.handle(rounds.Failed((name, 1, 0), attempt, "it is broken"), 102.0)
+    at = decider.next_at(102.0)
+    assert at is not None
+    out = decider.advance(at)
+    assert [each.record.parts for each in out if isinstance(each, rounds.Accept)] == [()] * 4
+    assert [each.clients for each in out if isinstance(each, rounds.MakeKeys)] == [names]
+    written = next(each.record for each in out if isinstance(each, rounds.WriteRound))
+    assert written.cohort is None
+    assert {order.attempt for order in written.orders} == {2, 4}
+
+
+def test_an_update_without_masks_is_refused_and_one_with_masks_too_where_there_are_none() -> None:
+    """It would be summed as noise."""
+    decider, names = keyed(replace(recipe(Mode.SYNC), update=Update(secagg=True)))
+    out = decider.handle(rounds.Arrived("r", update(names[0])), 101.0)
+    assert rounds.Refuse(names[0], "it is not masked") in out
+    decider, _, _ = started(recipe(Mode.SYNC))
+    out = decider.handle(rounds.Arrived("r", update("part-000", coding="masked")), 101.0)
+    assert rounds.Refuse("part-000", "it is masked") in out

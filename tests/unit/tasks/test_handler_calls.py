@@ -256,3 +256,15 @@ async def test_a_robot_that_is_lost_during_its_command_is_waited_for_with_the_re
     assert waits == ["waits for robot r1, lost since 22:13:20 UTC, while it held the red box", "r1 is back"]
     answer.set()
     assert await running == {"at": "dock"}
+
+
+async def test_another_part_of_the_gateway_answers_what_it_offers(calls: Calls) -> None:
+    """By name; what nobody offers is refused, as before."""
+
+    async def masks(call: Call) -> dict[str, Any]:
+        return {"masks": call.args["epoch"]}
+
+    with pytest.raises(PayloadError, match="'masks'"):
+        await calls(ask("masks", epoch="e"))
+    calls.offer("masks", masks)
+    assert await calls(ask("masks", epoch="e")) == {"masks": "e"}

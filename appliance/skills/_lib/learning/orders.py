@@ -1,8 +1,8 @@
 """The arguments of `train_local`, `aggregate` and `evaluate`, read and checked: a run's parameters are JSON of others.
 
     train_local  run, round, client, attempt, model, base, data, part, epochs, batch, optimiser, seed, stop_at_s,
-                 most_steps, speed, nominal_batch_s, every_steps, compression, residual
-    aggregate    run, round, model, base, updates, rule, clip, seed, classes, report
+                 most_steps, speed, nominal_batch_s, every_steps, compression, residual, secure
+    aggregate    run, round, model, base, updates, rule, clip, seed, classes, report, masks
     evaluate     model, base, data, part, split, limit, seed, export
 
 A subtask of a plan gives `model` alone, or with `epochs`: all else has a usual value.
@@ -16,6 +16,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any, Literal, NamedTuple, cast
 
+from .masks import Seed, read_seeds
+
 MOST_EPOCHS = 1000
 MOST_BATCH = 4096
 MOST_UPDATES = 10_000
@@ -24,8 +26,8 @@ MOST_WEIGHT = 1 << 40
 _DEFAULT_PART = {"by": "even", "index": 0, "of": 1}
 
 Table = dict[str, Any]
-Coding = Literal["none", "int8"]
-"""How an update's values are written: as they are, or in 8 bits (`coding`)."""
+Coding = Literal["none", "int8", "masked"]
+"""How an update's values are written: as they are, in 8 bits (`coding`), or so that their sum alone says something."""
 
 
 class OrderError(ValueError):
@@ -83,6 +85,8 @@ class Training(NamedTuple):
     residual: tuple[tuple[Table, ...], ...]
     """What coding left over of the client's last update, to be added to this one: files of one or several parts of it,
     each as a list of references."""
+    secure: str
+    """Names the masks that the update is sent with; empty: none."""
 
 
 class Update(NamedTuple):
@@ -119,6 +123,8 @@ class Aggregation(NamedTuple):
     classes: int | None
     report: bool
     """Whether too few fit updates are a result and no failure."""
+    masks: tuple[Seed, ...] | None
+    """Those that are left in the sum of masked updates; None: they are not masked."""
 
 
 class Evaluation(NamedTuple):
@@ -161,6 +167,7 @@ def training(params: Mapping[str, Any], *, robot: str | None) -> Training:
             _references(row, f"residual[{number}]")
             for number, row in enumerate(_rows(table.get("residual") or (), "residual"))
         ),
+        secure=_text(table, "secure", ""),
     )
 
 
@@ -187,7 +194,18 @@ def aggregation(params: Mapping[str, Any]) -> Aggregation:
         seed=_whole(table, "seed", 0, low=0, high=1 << 63),
         classes=None if table.get("classes") is None else _whole(table, "classes", 1, low=1, high=100_000),
         report=_flag(table, "report"),
+        masks=_masks(table.get("masks"), found),
     )
+
+
+def _masks(value: object, updates: Sequence[Update]) -> tuple[Seed, ...] | None:
+    given, coded = value is not None, {each.coding == "masked" for each in updates}
+    if coded != {given} or (given and len({each.client for each in updates}) < len(updates)):
+        raise OrderError("masks", "given" if given else None, "given with masked updates, one a client, and only then")
+    try:
+        return None if value is None else read_seeds(value)
+    except ValueError as error:
+        raise OrderError("masks", "a list", str(error)) from error
 
 
 def evaluation(params: Mapping[str, Any]) -> Evaluation:
@@ -346,8 +364,8 @@ def _update(value: object, number: int) -> Update:
 
 
 def _coding(value: object, name: str) -> Coding:
-    if value not in ("none", "int8"):
-        raise OrderError(name, value, "none or int8")
+    if value not in ("none", "int8", "masked"):
+        raise OrderError(name, value, "none, int8 or masked")
     return value
 
 

@@ -154,9 +154,11 @@ def base_refused(ctx: Context, error: ModelFileError) -> Exception:
     )
 
 
-def keep(ctx: Context, values: Mapping[str, NDArray[Any]], name: str) -> tuple[dict[str, Any], list[Reference]]:
+def keep(
+    ctx: Context, values: Mapping[str, NDArray[Any]], name: str, *, masked: bool = False
+) -> tuple[dict[str, Any], list[Reference]]:
     """Keep a model or update as artifacts; returns its manifest as a table, and references to its shards."""
-    norm = shards.squared_norm(values[each] for each in sorted(values)) ** 0.5
+    norm = None if masked else shards.squared_norm(values[each] for each in sorted(values)) ** 0.5
     files = list(shards.split(values))
     references = [
         ctx.put_artifact(f"{name}-{number:05d}.safetensors", data, "application/x-safetensors")
