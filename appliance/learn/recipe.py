@@ -130,6 +130,10 @@ def check(recipe: Recipe, source: str) -> None:
             robust.check_krum(per_round, int(rule["hostile"]))
     except ValueError as error:
         raise wrong("update.rule", str(error), "mean, median, trimmed:SHARE or multikrum:HOSTILE") from error
+    if recipe.update.dp is not None and recipe.update.rule != "mean":
+        raise wrong(
+            "update.rule", f"{recipe.update.rule} with update.dp, whose noise is for a mean", 'set it to "mean"'
+        )
     if recipe.update.secagg:
         _check_secagg(recipe, wrong)
     unknown = sorted(recipe.emulation.speeds.keys() - set(recipe.names))
@@ -185,7 +189,7 @@ def check_secure(recipe: Recipe, places: Mapping[str, str], most_samples: int) -
             remedy="see that the robots' gateways answer",
         )
     try:
-        masks.check_bits(len(recipe.names), most_samples)
+        masks.check_bits(len(recipe.names), most_samples if recipe.update.dp is None else 1)
         if not recipe.clients.per_round:
             secagg.check_spread(places)
     except (ValueError, RefusedError) as error:

@@ -54,6 +54,7 @@ from appliance.plane.records import Record
 from appliance.skills._lib.learning import shards
 from appliance.skills._lib.learning.masks import Seed
 from appliance.skills._lib.learning.seeds import seed
+from appliance.skills._lib.learning.weights import WEIGHT_UNIT
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.artifacts import Artifacts
 from appliance.tasks.checkpoints import Checkpoint, checkpoint_key
@@ -783,6 +784,8 @@ class RoundDriver:
             # What helpers' parts leave over is the client's: one of them adds all of it.
             "residual": [list(each) for each in client.residual] if client is not None and not order.part else [],
             "secure": self._epoch(),
+            # Of a masked update nobody else can.
+            "clip": recipe.update.dp.clip if recipe.update.dp is not None and recipe.update.secagg else None,
         }
 
     def _epoch(self) -> str:
@@ -942,6 +945,9 @@ class RoundDriver:
             "seed": recipe.seed,
             "report": True,
         }
+        if (dp := recipe.update.dp) is not None:
+            unit = 1 if recipe.update.secagg else WEIGHT_UNIT
+            params |= {"clip": dp.clip, "noise": dp.noise * dp.clip * unit}
         record = self.record()
         if record is not None and record.cohort is not None:
             left = await self._leftover_or_failed(aggregate, record.cohort)

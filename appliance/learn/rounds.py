@@ -40,6 +40,7 @@ from typing import NamedTuple
 from msgspec import Struct, field
 from msgspec.structs import replace
 
+from appliance.learn.privacy import epsilon
 from appliance.learn.secagg import threshold
 from appliance.model.learning import (
     ClientState,
@@ -352,6 +353,7 @@ def closed(run: RunRecord, result: Result, *, now_ns: int) -> RunRecord | None:
         digest=result.model.digest,
         why=record.closed_by,
         sent_bytes=sum(each.sent_bytes for each in counted),
+        epsilon=_epsilon(run, clients),
     )
     last = record.number >= run.recipe.rounds.count
     return replace(
@@ -367,6 +369,14 @@ def closed(run: RunRecord, result: Result, *, now_ns: int) -> RunRecord | None:
         history=(*run.history, line)[-HISTORY:],
         updated_ns=now_ns,
     )
+
+
+def _epsilon(run: RunRecord, clients: Iterable[ClientState]) -> float | None:
+    """ε of a run's models for the client that took part most often; None without differential privacy."""
+    dp = run.recipe.update.dp
+    if dp is None:
+        return None
+    return epsilon(dp.noise, max((client.rounds for client in clients), default=0), dp.delta)
 
 
 def kept_models(models: tuple[Model, ...], keep: int) -> tuple[Model, ...]:
@@ -1234,7 +1244,8 @@ class Decider:
         parts = self._parts[client]
         samples = sum(part.samples for part in parts.values())
         staleness = self.number - min(part.round for part in parts.values())
-        weight = samples if self._secure else stale_weight(samples, staleness)
+        held = samples if self._run.recipe.update.dp is None else 1  # of whom nobody can tell whether they took part
+        weight = held if self._secure else stale_weight(held, staleness)
         done = sum(part.steps for part in parts.values())
         share = sum(_length(part.share) for part in parts.values())
         whole = round(sum(part.steps_whole for part in parts.values()) / max(0.01, share))

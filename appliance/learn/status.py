@@ -141,4 +141,5 @@ def metric(run: RunRecord, number: int) -> RunMetric | None:
         loss=line.loss,
         accuracy=line.accuracy,
         test_loss=model.loss if model is not None else None,
+        epsilon=line.epsilon,
     )

@@ -64,6 +64,11 @@ def shown(found: LearnShown) -> RenderableType:
             f"model {run.model.number} {run.model.digest[:12]} on {', '.join(run.model.gateways) or 'no gateway yet'}"
         ),
     ]
+    if (dp := run.recipe.update.dp) is not None:
+        spent = run.history[-1].epsilon if run.history else 0.0
+        parts.append(
+            Text(f"privacy: ε {number(spent)} at δ {dp.delta:g} so far (clip {dp.clip:g}, noise {dp.noise:g})")
+        )
     if open_round is not None and not run.state.final:
         deadline = f", deadline {seconds(open_round.deadline_s)}" if open_round.deadline_s is not None else ""
         parts.append(

@@ -105,6 +105,17 @@ class Rounds(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkno
     """Clients whose updates a model needs."""
 
 
+class Dp(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
+    """`dp`: differential privacy of clients."""
+
+    clip: Annotated[float, Meta(gt=0, le=1e6)]
+    """Longest update: its norm is cut to this. All clients weigh the same."""
+    noise: Annotated[float, Meta(ge=0.01, le=1e6)]
+    """Standard deviation of the noise in the sum, as a multiple of `clip`."""
+    delta: Annotated[float, Meta(gt=0, lt=1)] = 1e-5
+    """At which ε is told."""
+
+
 class Update(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
     """`[update]`: how updates become one."""
 
@@ -114,6 +125,8 @@ class Update(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkno
     """How clients send their updates: as they are, or in 8 bits, with what that rounds off added to the next one."""
     secagg: bool = False
     """Secure aggregation: clients mask their updates, only the sum can be read. With mode `sync` and robots."""
+    dp: Dp | None = None
+    """Differential privacy: updates are clipped, and noise is added to their sum. With rule `mean`."""
 
 
 class Evaluation(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
@@ -246,6 +259,8 @@ class Closed(Struct, frozen=True, kw_only=True, omit_defaults=True):
     why: str = ""
     sent_bytes: int = 0
     """Size of the updates that counted, as files."""
+    epsilon: float | None = None
+    """With differential privacy: ε of the models so far, for the client that took part most often."""
 
 
 class RunRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -494,3 +509,5 @@ class RunMetric(Struct, frozen=True, kw_only=True, omit_defaults=True):
     accuracy: float | None = None
     """On the test part; None: not evaluated, or not yet."""
     test_loss: float | None = None
+    epsilon: float | None = None
+    """With differential privacy: ε of the models so far."""

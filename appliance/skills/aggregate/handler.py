@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 from _lib import params
 from _lib.context import Context
 from _lib.learning import aggregation, masks, models, orders, shards, work
@@ -38,7 +39,7 @@ def run(ctx: Context) -> dict[str, Any]:
 
     try:
         aggregator = Aggregator(pieces, _base(ctx, order, model, classes, pieces), keep, alive=work.Alive(ctx))
-        result = aggregator.run(updates, order.rule, clip=order.clip)
+        result = aggregator.run(updates, order.rule, clip=order.clip, noise=order.noise)
     except ModelFileError as error:
         raise work.base_refused(ctx, error) from error
     except TooFewError as error:
@@ -91,7 +92,9 @@ def _unmasked(ctx: Context, order: Aggregation, model: work.Model, seeds: Sequen
         told = {each.client: Verdict(accepted=False, reason="lost", message=str(error)) for each in order.updates}
         return _too_few(ctx, order, error if isinstance(error, TooFewError) else TooFewError(str(error), 1, told))
     base = work.base_values(ctx, order.base, tensors, order.seed)
-    values = {name: base[name] + changes.pop(name) for name in sorted(base)}
+    deviation = 0.0 if order.noise is None else order.noise / sum(each.weight for each in updates)
+    noisy = {name: aggregation.noisy(changes.pop(name), deviation) for name in sorted(base)}
+    values = {name: (base[name] + change).astype(np.float32) for name, change in noisy.items()}
     manifest, references = work.keep(ctx, values, "model")
     verdicts = _told({each.client: Verdict(accepted=True) for each in updates})
     made = {"manifest": manifest, "shards": references}

@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from _lib.context import Context, Surroundings
-from _lib.learning import orders, training, work
+from _lib.learning import orders, shards, training, work
 from _lib.learning.decoders import CorruptFileError
 from _lib.learning.masks import Seed, masked, read_seeds
 from _lib.learning.models import Tensor
@@ -118,7 +119,10 @@ def _keep_masked(
     ctx: Context, order: orders.Training, delta: dict[str, work.Floats], held: work.Share, seeds: Sequence[Seed]
 ) -> dict[str, Any]:
     """Keep the update as artifacts with its masks on; without them it never leaves this process."""
-    values = masked(delta, len(held.arrays), seeds)
+    norm = shards.squared_norm(delta[each] for each in sorted(delta)) ** 0.5
+    if order.clip is not None and norm > order.clip:
+        delta = {name: array * np.float32(order.clip / norm) for name, array in delta.items()}
+    values = masked(delta, len(held.arrays) if order.clip is None else 1, seeds)
     manifest, references = work.keep(ctx, values, f"update-{order.round}", masked=True)
     return {"manifest": manifest, "shards": references, "coding": "masked"}
 

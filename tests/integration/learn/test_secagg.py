@@ -1,13 +1,15 @@
 """Secure aggregation with real gateways and containers: the same models as without, and no update in the clear."""
 
+import json
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
 from appliance.client import FleetClient
+from appliance.learn import privacy
 from appliance.learn.datasets.make import Clips, make_clips
-from appliance.model.learning import Clients, Data, Evaluation, Mode, Recipe, Rounds, RunState, Update
+from appliance.model.learning import Clients, Data, Dp, Evaluation, Mode, Recipe, Rounds, RunState, Update
 from appliance.pool.settings import PoolConfig
 from appliance.skills._lib.learning import shards
 from tests.integration.learn.test_faults import ended, fleet_of, write_model
@@ -57,5 +59,18 @@ async def test_masked_updates_make_the_models_of_plain_ones(tmp_path: Path) -> N
             clear = await ended(client, f"plain-{robots}")
             assert [line.clients for line in secure.history] == [robots, robots], secure
             assert [line.digest for line in secure.history] == [line.digest for line in clear.history]
+            assert {each.epsilon for each in secure.history} == {None}
             for file in (tmp_path / "data-2" / "drone_4" / "clips").rglob("*.avi"):
                 file.write_bytes(b"damaged")
+        base = models.initial(models.read("sound", [tmp_path / "data-1" / "models"]).tensors(10), masked.seed)
+        for name, recipe in (("dp-masked", masked), ("dp-plain", plain)):
+            private = replace(recipe.update, dp=Dp(clip=0.01, noise=0.02))
+            await client.learn_start(name, replace(recipe, update=private, rounds=replace(recipe.rounds, count=1)))
+            run = await ended(client, name)
+            assert [(line.clients, line.epsilon) for line in run.history] == [(3, privacy.epsilon(0.02, 1, 1e-5))]
+            manifest = shards.parse_manifest(json.loads(await client.artifact(run.model.manifest or {})))
+            files = [await client.artifact(reference) for reference in run.model.shards]
+            values = shards.join(manifest, files)
+            # Each of three updates is cut to 0.01, and the noise of 650 values adds 0.0002 x 25 / 3 to their mean.
+            change = shards.squared_norm(values[tensor] - base[tensor] for tensor in values) ** 0.5
+            assert 0.002 < change < 0.013, (name, change)

@@ -1,5 +1,6 @@
 """Updates into a model: the order of updates changes nothing, and what is unfit is left out with its reason."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -59,11 +60,13 @@ def _part(values: Arrays, piece: shards.Piece) -> Any:
     return whole if piece.cut is None else whole[rows : rows + piece.shape[0]]
 
 
-def aggregate(updates: list[Update], rule: Rule = MEAN, *, clip: float | None = None) -> tuple[Result, Arrays]:
+def aggregate(
+    updates: list[Update], rule: Rule = MEAN, *, clip: float | None = None, noise: float | None = None
+) -> tuple[Result, Arrays]:
     """Return the result, and the change of the model as whole arrays: the base is all ones."""
     base = {piece.key: np.ones(piece.shape, dtype=np.float32) for piece in PIECES}
     kept: dict[int, bytes] = {}
-    result = Aggregator(PIECES, lambda _: base, kept.__setitem__).run(updates, rule, clip=clip)
+    result = Aggregator(PIECES, lambda _: base, kept.__setitem__).run(updates, rule, clip=clip, noise=noise)
     model = shards.join(result.manifest, [kept[index] for index in sorted(kept)])
     return result, {name: values - 1 for name, values in model.items()}
 
@@ -305,3 +308,20 @@ def test_too_few_updates_say_how_many_are_needed() -> None:
     with pytest.raises(TooFewError) as caught:
         aggregate([update("a", arrays(1)), wrong], Rule("multikrum", 0, 1))
     assert (caught.value.needed, list(caught.value.verdicts)) == (5, ["wrong"])
+
+
+def test_noise_is_added_once_and_is_another_each_time() -> None:
+    """Its deviation is that asked for over the sum of weights; a client far from the others is clipped."""
+    plain = arrays(5)
+    far = {name: values * np.float32(1000) for name, values in plain.items()}
+    updates = [update("a", plain), update("b", plain), update("c", plain), update("d", far)]
+    refused, _ = aggregate(updates, clip=0.5)
+    assert not refused.verdicts["d"].accepted
+    seen: list[Arrays] = []
+    for _ in range(2):
+        result, changes = aggregate(updates, clip=0.5, noise=3.0 * 1024)
+        assert all(verdict.accepted for verdict in result.verdicts.values())
+        seen.append(changes)
+    noise = np.concatenate([(seen[0][name] - seen[1][name]).reshape(-1) for name in plain])
+    assert noise.std() == pytest.approx(3.0 / 4 * math.sqrt(2), rel=0.1)
+    assert abs(noise.mean()) < 0.1

@@ -52,6 +52,7 @@ from appliance.model.learning import (
     RunRecord,
     RunState,
     Side,
+    Training,
     Update,
     UpdateRecord,
 )
@@ -663,3 +664,19 @@ async def test_where_keys_are_lost_the_clients_train_anew_with_others(monkeypatc
     assert first[0].epoch != second.epoch
     orders = [request for request in fleet.asked if request.skill == round_driver.TRAIN]
     assert {request.attempt for request in orders if request.params["secure"] == second.epoch} == {2}
+
+
+async def test_the_steps_of_several_epochs_are_a_whole_update() -> None:
+    """A client says the steps of one epoch; ordered three, it makes three times as many, and that is no fault."""
+    recipe = replace(RECIPE, training=Training(epochs=3))
+
+    def answer(request: RunRequest) -> RunEvent:
+        event = trained(request)
+        return replace(event, result={**(event.result or {}), "steps": 6, "steps_of_epoch": 2})
+
+    fleet = Fleet(replace(RUN, recipe=recipe), answers=answer)
+    driving = asyncio.create_task(fleet.driver.drive())
+    await until(lambda: any(request.skill == round_driver.AGGREGATE for request in fleet.asked))
+    driving.cancel()
+    sums = next(request.params for request in fleet.asked if request.skill == round_driver.AGGREGATE)
+    assert [each["scale"] for each in sums["updates"]] == [1, 1]

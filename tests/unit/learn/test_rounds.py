@@ -8,13 +8,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from appliance.learn import rounds
+from appliance.learn import privacy, rounds
 from appliance.learn.rounds import Decider
 from appliance.model.learning import (
     Clients,
     ClientState,
     Cohort,
     Data,
+    Dp,
     Mode,
     Model,
     Order,
@@ -781,3 +782,21 @@ def test_an_update_without_masks_is_refused_and_one_with_masks_too_where_there_a
     decider, _, _ = started(recipe(Mode.SYNC))
     out = decider.handle(rounds.Arrived("r", update("part-000", coding="masked")), 101.0)
     assert rounds.Refuse("part-000", "it is masked") in out
+
+
+def test_with_differential_privacy_all_clients_weigh_the_same_and_epsilon_grows() -> None:
+    """Whatever their samples; the history tells what the models so far tell of the client that took part most often."""
+    made = replace(recipe(Mode.SYNC, clients=4, count=3), update=Update(dp=Dp(clip=1.0, noise=2.0)))
+    various = {name: Device(1.0, 10 * (number + 1)) for number, name in enumerate(made.names)}
+    shares: list[int] = []
+
+    class Noted(Simulation):
+        def _made(self, aggregate: rounds.Aggregate) -> rounds.Event:
+            shares.extend(share.weight for share in aggregate.shares)
+            return super()._made(aggregate)
+
+    outcome = Noted(made, various).play()
+    assert set(shares) == {1024}
+    assert [line.epsilon for line in outcome.run.history] == [privacy.epsilon(2.0, k, 1e-5) for k in (1, 2, 3)]
+    plain = Simulation(recipe(Mode.SYNC, clients=4, count=1), devices(4)).play()
+    assert plain.run.history[0].epsilon is None

@@ -9,6 +9,7 @@ An update may cover only part of an epoch: `scale` makes it that of a whole one 
 """
 
 import math
+import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -107,8 +108,17 @@ class Aggregator:
         self._norms: dict[str, float] = {}
         self._verdicts: dict[str, Verdict] = {}
 
-    def run(self, updates: Sequence[Update], rule: Rule, *, clip: float | None = None) -> Result:
+    def run(
+        self, updates: Sequence[Update], rule: Rule, *, clip: float | None = None, noise: float | None = None
+    ) -> Result:
         """Return the new model and the verdicts; each client has one update.
+
+        Args:
+            updates: what is summed.
+            rule: how.
+            clip: longest norm; longer updates are scaled down to it.
+            noise: standard deviation of the noise that is added to the weighted sum. Norms are not compared then: what
+                is summed of one client may not depend on others.
 
         Raises:
             TooFewError: no update is fit, or the rule needs more of them.
@@ -116,7 +126,7 @@ class Aggregator:
         """
         self._verdicts = {}
         fit = self._examine(updates)
-        bound = shards.norm_bound([self._norms[each.client] for each in fit])
+        bound = shards.norm_bound([self._norms[each.client] for each in fit]) if noise is None else math.inf
         fit = [each for each in fit if self._within(each, bound)]
         if not fit:
             reasons = "; ".join(f"{client}: {each.message}" for client, each in sorted(self._verdicts.items()))
@@ -124,7 +134,7 @@ class Aggregator:
         while True:
             try:
                 chosen = self._select(fit, rule)
-                manifest = self._make(chosen, rule, clip)
+                manifest = self._make(chosen, rule, clip, noise)
             except _UnfitError as error:
                 self._refuse(error.client, error.reason, str(error))
                 fit = [each for each in fit if each.client != error.client]
@@ -193,7 +203,8 @@ class Aggregator:
 
     # --- sums
 
-    def _make(self, fit: Sequence[Update], rule: Rule, clip: float | None) -> Manifest:
+    def _make(self, fit: Sequence[Update], rule: Rule, clip: float | None, noise: float | None) -> Manifest:
+        deviation = 0.0 if noise is None else noise / sum(each.weight for each in fit)
         files: list[shards.Shard] = []
         squares = 0.0
         for index in range(self._count):
@@ -202,7 +213,8 @@ class Aggregator:
             base = self._base(index)
             fresh: dict[str, NDArray[Any]] = {}
             for piece in self._of(index):
-                fresh[piece.key] = (base[piece.key] + changes.pop(piece.key)).astype(np.float32)
+                change = noisy(changes.pop(piece.key), deviation)
+                fresh[piece.key] = (base[piece.key] + change).astype(np.float32)
                 squares += shards.squared_norm([fresh[piece.key]])
             data = shards.encode(fresh)
             self._keep(index, data)
@@ -281,6 +293,14 @@ class Aggregator:
                 self._kept_bytes += len(data)
             self._alive()
         return coding.decode_shard(arrays, self._of(index)) if file.coded else arrays
+
+
+def noisy(values: Floats, deviation: float) -> NDArray[Any]:
+    """Return values with Gaussian noise, which nobody can draw again: no seed of a run leads to it."""
+    if not deviation:
+        return values
+    chance = np.random.Generator(np.random.Philox(secrets.randbits(128)))
+    return values + chance.normal(0.0, deviation, values.shape)
 
 
 class _UnfitError(ValueError):

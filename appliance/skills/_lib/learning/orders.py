@@ -1,8 +1,8 @@
 """The arguments of `train_local`, `aggregate` and `evaluate`, read and checked: a run's parameters are JSON of others.
 
     train_local  run, round, client, attempt, model, base, data, part, epochs, batch, optimiser, seed, stop_at_s,
-                 most_steps, speed, nominal_batch_s, every_steps, compression, residual, secure
-    aggregate    run, round, model, base, updates, rule, clip, seed, classes, report, masks
+                 most_steps, speed, nominal_batch_s, every_steps, compression, residual, secure, clip
+    aggregate    run, round, model, base, updates, rule, clip, seed, classes, report, masks, noise
     evaluate     model, base, data, part, split, limit, seed, export
 
 A subtask of a plan gives `model` alone, or with `epochs`: all else has a usual value.
@@ -87,6 +87,8 @@ class Training(NamedTuple):
     each as a list of references."""
     secure: str
     """Names the masks that the update is sent with; empty: none."""
+    clip: float | None
+    """Of a masked update: its longest norm. Its weight is 1 then, whatever its samples."""
 
 
 class Update(NamedTuple):
@@ -123,6 +125,8 @@ class Aggregation(NamedTuple):
     classes: int | None
     report: bool
     """Whether too few fit updates are a result and no failure."""
+    noise: float | None
+    """Standard deviation of the noise that is added to the weighted sum; None: none is."""
     masks: tuple[Seed, ...] | None
     """Those that are left in the sum of masked updates; None: they are not masked."""
 
@@ -168,6 +172,7 @@ def training(params: Mapping[str, Any], *, robot: str | None) -> Training:
             for number, row in enumerate(_rows(table.get("residual") or (), "residual"))
         ),
         secure=_text(table, "secure", ""),
+        clip=_optional(table, "clip"),
     )
 
 
@@ -194,6 +199,7 @@ def aggregation(params: Mapping[str, Any]) -> Aggregation:
         seed=_whole(table, "seed", 0, low=0, high=1 << 63),
         classes=None if table.get("classes") is None else _whole(table, "classes", 1, low=1, high=100_000),
         report=_flag(table, "report"),
+        noise=_optional(table, "noise"),
         masks=_masks(table.get("masks"), found),
     )
 
