@@ -11,7 +11,7 @@ from appliance.learn import privacy
 from appliance.learn.datasets.make import Clips, make_clips
 from appliance.model.learning import Clients, Data, Dp, Evaluation, Mode, Recipe, Rounds, RunState, Update
 from appliance.pool.settings import PoolConfig
-from appliance.skills._lib.learning import shards
+from appliance.skills._lib.learning import models, shards
 from tests.integration.learn.test_faults import ended, fleet_of, write_model
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(600), pytest.mark.long]
@@ -53,8 +53,8 @@ async def test_masked_updates_make_the_models_of_plain_ones(tmp_path: Path) -> N
             secure = await ended(client, f"masked-{robots}")
             assert secure.state is RunState.SUCCEEDED
             if robots == 4:
-                models = {str(each["artifact"]) for model in secure.models for each in model.shards}
-                assert types_of_files(Path(fleet.directory), models) == {"I64"}
+                known = {str(each["artifact"]) for model in secure.models for each in model.shards}
+                assert types_of_files(Path(fleet.directory), known) == {"I64"}
             await client.learn_start(f"plain-{robots}", plain)
             clear = await ended(client, f"plain-{robots}")
             assert [line.clients for line in secure.history] == [robots, robots], secure
