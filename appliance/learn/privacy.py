@@ -18,8 +18,8 @@ def delta(epsilon: float, mu: float) -> float:
     return _normal(-epsilon / mu + mu / 2.0) - math.exp(epsilon) * _normal(-epsilon / mu - mu / 2.0)
 
 
-def epsilon(noise: float, rounds: int, at_delta: float) -> float:
-    """Return ε for a client that has taken part so often, rounded up to 0.001.
+def epsilon(noise: float, rounds: int, at_delta: float) -> float | None:
+    """Return ε for a client that has taken part so often, rounded up to 0.001; None where it is above `MOST`.
 
     Args:
         noise: standard deviation of the noise in each round's sum, as a multiple of the clip.
@@ -34,7 +34,7 @@ def epsilon(noise: float, rounds: int, at_delta: float) -> float:
         return 0.0
     while delta(high, mu) > at_delta:
         if high >= MOST:
-            return math.inf
+            return None
         low, high = high, min(MOST, 2.0 * high)
     while high - low > 1e-6:
         middle = (low + high) / 2.0

@@ -7,6 +7,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from appliance.learn import privacy
 from appliance.learn.status import statuses
 from appliance.model.learn_api import ClientWhy, LearnShown
 from appliance.model.learning import Activity, ClientState, ClientStatus, Model, RunRecord
@@ -66,9 +67,8 @@ def shown(found: LearnShown) -> RenderableType:
     ]
     if (dp := run.recipe.update.dp) is not None:
         spent = run.history[-1].epsilon if run.history else 0.0
-        parts.append(
-            Text(f"privacy: ε {number(spent)} at δ {dp.delta:g} so far (clip {dp.clip:g}, noise {dp.noise:g})")
-        )
+        told = f"above {privacy.MOST:g}" if spent is None else number(spent)
+        parts.append(Text(f"privacy: ε {told} at δ {dp.delta:g} so far (clip {dp.clip:g}, noise {dp.noise:g})"))
     if open_round is not None and not run.state.final:
         deadline = f", deadline {seconds(open_round.deadline_s)}" if open_round.deadline_s is not None else ""
         parts.append(

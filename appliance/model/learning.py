@@ -260,7 +260,7 @@ class Closed(Struct, frozen=True, kw_only=True, omit_defaults=True):
     sent_bytes: int = 0
     """Size of the updates that counted, as files."""
     epsilon: float | None = None
-    """With differential privacy: ε of the models so far, for the client that took part most often."""
+    """With differential privacy: ε of the models so far, for the client that took part most often. None: above 500."""
 
 
 class RunRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):

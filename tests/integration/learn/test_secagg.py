@@ -64,13 +64,13 @@ async def test_masked_updates_make_the_models_of_plain_ones(tmp_path: Path) -> N
                 file.write_bytes(b"damaged")
         base = models.initial(models.read("sound", [tmp_path / "data-1" / "models"]).tensors(10), masked.seed)
         for name, recipe in (("dp-masked", masked), ("dp-plain", plain)):
-            private = replace(recipe.update, dp=Dp(clip=0.01, noise=0.02))
+            private = replace(recipe.update, dp=Dp(clip=0.01, noise=1.0))
             await client.learn_start(name, replace(recipe, update=private, rounds=replace(recipe.rounds, count=1)))
             run = await ended(client, name)
-            assert [(line.clients, line.epsilon) for line in run.history] == [(3, privacy.epsilon(0.02, 1, 1e-5))]
+            assert [(line.clients, line.epsilon) for line in run.history] == [(3, privacy.epsilon(1.0, 1, 1e-5))]
             manifest = shards.parse_manifest(json.loads(await client.artifact(run.model.manifest or {})))
             files = [await client.artifact(reference) for reference in run.model.shards]
             values = shards.join(manifest, files)
-            # Each of three updates is cut to 0.01, and the noise of 650 values adds 0.0002 x 25 / 3 to their mean.
+            # Each of three updates is cut to 0.01; noise of 0.01 in 650 values adds a third of 0.255 to their mean.
             change = shards.squared_norm(values[tensor] - base[tensor] for tensor in values) ** 0.5
-            assert 0.002 < change < 0.013, (name, change)
+            assert 0.05 < change < 0.12, (name, change)

@@ -34,7 +34,7 @@ def test_epsilon_of_little_noise() -> None:
 def test_epsilon_is_the_smallest_that_holds_by_the_definition(noise: float, rounds: int, delta: float) -> None:
     """δ is the integral of max(0, p - e^ε q) over the two densities of the sum of all rounds; ε gives that δ."""
     found = privacy.epsilon(noise, rounds, delta)
-    if not 0.01 < found < 100.0:
+    if found is None or not 0.01 < found < 100.0:
         return
     mu = math.sqrt(rounds) / noise
     x = np.linspace(-40.0, 40.0 + mu, 400_001)
@@ -48,8 +48,10 @@ def test_epsilon_is_the_smallest_that_holds_by_the_definition(noise: float, roun
 
 
 def test_more_rounds_and_less_noise_tell_more() -> None:
-    """Nothing before the first round; what is beyond all measure is infinite."""
+    """Nothing before the first round; what is beyond all measure is not told."""
     assert privacy.epsilon(1.0, 0, 1e-5) == 0.0
-    told = [privacy.epsilon(noise, rounds, 1e-5) for noise, rounds in ((4.0, 1), (4.0, 10), (2.0, 10), (1.0, 100))]
-    assert told == sorted(told)
-    assert privacy.epsilon(0.01, 1000, 1e-5) == math.inf
+    told = [
+        privacy.epsilon(noise, rounds, 1e-5) or 0.0 for noise, rounds in ((4.0, 1), (4.0, 10), (2.0, 10), (1.0, 90))
+    ]
+    assert 0.0 < told[0] < told[1] < told[2] < told[3]
+    assert privacy.epsilon(0.01, 1000, 1e-5) is None
