@@ -64,7 +64,7 @@ async def test_of_a_run_whose_record_cannot_be_read_everything_stays(tmp_path: P
     for owner in owners:
         await artifacts.put("model", owner.encode(), "text/plain", owner=owner)
     held = Records()
-    plane = cast("Any", SimpleNamespace(dht=held))
+    plane = cast("Any", SimpleNamespace(dht=held, gateway="gw-1"))
     manager = LearnManager(plane, artifacts, manifest=cast("Any", None), copies=1, folder=tmp_path, keep_ended=2)
     await manager._forget()  # pyright: ignore[reportPrivateUsage]
     left = {owner.removeprefix(records.PREFIX) for owner in await artifacts.owners()}
@@ -79,7 +79,7 @@ async def test_files_of_a_run_without_a_record_stay_for_a_day_unless_it_was_remo
     artifacts = Artifacts(tmp_path / "artifacts", gateway="gw-1", max_bytes=1 << 20)
     for run in ("gone", "elsewhere"):
         await artifacts.put("model", run.encode(), "text/plain", owner=f"{records.round_key(run, 1)}/model")
-    plane = cast("Any", SimpleNamespace(dht=Records()))
+    plane = cast("Any", SimpleNamespace(dht=Records(), gateway="gw-1"))
     manager = LearnManager(plane, artifacts, manifest=cast("Any", None), copies=1, folder=tmp_path, keep_ended=2)
     await manager._forget()  # pyright: ignore[reportPrivateUsage]
     assert await artifacts.owners() == ("learn/elsewhere/1/model",)
@@ -101,7 +101,7 @@ async def test_the_oldest_ended_runs_are_removed_but_those_with_a_marked_model(t
     for key in (records.round_key("r4", 6), records.round_key("r4", 7), records.round_key("open", 6)):
         held.stored[key] = Record(key=key)
     artifacts = Artifacts(tmp_path / "artifacts", gateway="gw-1", max_bytes=1 << 20)
-    plane = cast("Any", SimpleNamespace(dht=held))
+    plane = cast("Any", SimpleNamespace(dht=held, gateway="gw-1"))
     manager = LearnManager(plane, artifacts, manifest=cast("Any", None), copies=1, folder=tmp_path, keep_ended=2)
     await manager._forget()  # pyright: ignore[reportPrivateUsage]
     assert held.taken == ["learn/r4/6", "learn/r1", "learn/r2"]
@@ -115,7 +115,7 @@ async def test_a_run_is_removed_when_it_has_ended(tmp_path: Path) -> None:
         held.stored[key] = Record(key=key)
     held.stored["learn/done"] = Record(key="learn/done", value=encode(ended))
     artifacts = Artifacts(tmp_path / "artifacts", gateway="gw-1", max_bytes=1 << 20)
-    plane = cast("Any", SimpleNamespace(dht=held))
+    plane = cast("Any", SimpleNamespace(dht=held, gateway="gw-1"))
     manager = LearnManager(plane, artifacts, manifest=cast("Any", None), copies=1, folder=tmp_path, keep_ended=2)
     assert await manager.steer(LearnSteerAsk(run="done", do="remove")) == ended
     assert sorted(held.taken) == ["learn/done", "learn/done/10", "learn/done/9", "learn/done/9/part-000"]
