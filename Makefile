@@ -30,7 +30,7 @@ test: ## Set up and run the tests: lint, types, import contracts, unit, integrat
 	scripts/whole_suite.sh -m 'not long' tests/unit tests/reports tests/replay tests/integration
 
 long: ## Set up and run the long tests
-	scripts/setup.sh dev --with-browser
+	scripts/setup.sh dev --with-browser --with-prometheus
 	$(MAKE) --no-print-directory docs
 	scripts/whole_suite.sh -m long tests/unit tests/reports tests/replay tests/integration
 

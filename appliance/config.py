@@ -15,6 +15,7 @@ from msgspec import Struct, field
 from appliance.errors import ConfigError, PayloadError
 from appliance.llm.settings import LlmConfig, SafetyConfig
 from appliance.model.keys import check_name
+from appliance.observe.settings import ObserveConfig
 from appliance.plane.settings import PlaneConfig, dialled_here
 from appliance.pool.settings import PoolConfig
 from appliance.record.settings import RecordConfig
@@ -53,6 +54,7 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     robots: RobotsConfig = field(default_factory=RobotsConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
     tasks: TasksConfig = field(default_factory=TasksConfig)
+    observe: ObserveConfig = field(default_factory=ObserveConfig)
 
     def endpoints(self) -> tuple[str, ...]:
         """Where this gateway and the others are reached, by its configuration, each once."""
@@ -108,6 +110,7 @@ def check(config: GatewayConfig, source: str) -> None:
         config.record.check()
         config.llm.check()
         config.safety.check()
+        config.observe.check()
     except (PayloadError, ConfigError) as error:
         raise ConfigError(f"{source}: {error.message}", remedy=error.remedy) from error
     if config.log_level not in ("debug", "info", "warning", "error"):

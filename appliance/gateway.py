@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 import structlog
@@ -50,9 +50,12 @@ from appliance.model import (
     VolumeInfo,
     keyspace,
 )
+from appliance.model.alerts import AlertsAsk
 from appliance.model.planner_api import ProposeAsk, Proposed, SwapAsk, Swapped
 from appliance.model.recorder_api import RecorderStatus
+from appliance.model.robot_api import LinksAsk
 from appliance.model.task_api import ArtifactAsk, ArtifactKeep, ArtifactKept, ArtifactPiece, SiteAsk
+from appliance.observe.facts import Facts
 from appliance.plane.events import AuthorityChanged, FactsChanged, FleetEvent, Lost, Stage
 from appliance.plane.node import Plane
 from appliance.plane.records import Record
@@ -89,6 +92,12 @@ from appliance.tasks.migration.policy import Load
 from appliance.tasks.offload import RemoteContainers
 from appliance.tasks.retention import Retention
 from appliance.tasks.stream import Kept
+from appliance.tasks.views import status as task_status
+
+if TYPE_CHECKING:
+    from appliance.observe.observer import Observer
+
+T = TypeVar("T")
 
 
 def orders_of(config: GatewayConfig, site: Site, *, roster: Callable[[], Mapping[str, RobotInfo]]) -> Orders:
@@ -221,6 +230,18 @@ def resolve(key: str, one: Record, other: Record) -> Record:
     return (learn_records.resolve if key.startswith(learn_records.PREFIX) else resolver)(key, one, other)
 
 
+def both(first: Callable[[T], None], second: Callable[[T], None] | None) -> Callable[[T], None]:
+    """Return what hands a thing to both; without a second it is the first."""
+    if second is None:
+        return first
+
+    def hear(thing: T) -> None:
+        first(thing)
+        second(thing)
+
+    return hear
+
+
 VERSION = "0.1.0"
 SETTLE_S = 3.0
 """How long a draining gateway waits for the ends of its runs to be written: a replicated write takes milliseconds."""
@@ -243,6 +264,8 @@ class Gateway:
         self._site_problem = ""
         self._recorders = Recorders()
         self._parts = ALL
+        self._observer: Observer | None = None
+        """Tells monitoring systems; None: nothing of that is on."""
 
     async def start(self) -> None:
         """Build and start every part; on failure, what was started is stopped again and the error raised."""
@@ -261,8 +284,7 @@ class Gateway:
             config.plane, fleet=config.fleet, gateway=config.id, data_dir=self._data, resolver=resolve
         )
         self._stack.push_async_callback(self.plane.close)
-        logs.publish_to(self._put_log)
-        self._stack.callback(logs.publish_to, None)
+        observer = self._start_telling()
         await self.plane.until_back()
         catalogue = await self._take_parts(catalogue)
 
@@ -291,7 +313,7 @@ class Gateway:
         enquiries = Enquiries(self.plane)
         enquiries.start(audit)
         self._stack.push_async_callback(enquiries.close)
-        telling = Telling(self.plane, on_event=self._kept.hear_event)
+        telling = Telling(self.plane, on_event=both(self._kept.hear_event, observer and observer.hear_event))
         self._calls = calls = Calls(
             self.plane,
             artifacts,
@@ -321,7 +343,7 @@ class Gateway:
             site=site,
             find_remote=remote.find,
             facts=remote.facts,
-            on_call=functools.partial(holds.guard, carry_out=calls),
+            on_call=functools.partial(holds.guard, carry_out=observer.timed(calls) if observer else calls),
             on_change=self._on_containers,
             state=storage.state,
             store=self.plane.store,
@@ -363,8 +385,8 @@ class Gateway:
             out_of_use=self._out_of_use,
             audit=audit,
             on_change=self._changed.set,
-            on_transition=self._kept.hear_transition,
-            on_record=self._alerts.moved,
+            on_transition=both(self._kept.hear_transition, observer and observer.hear_transition),
+            on_record=both(self._alerts.moved, observer and observer.hear_record),
         )
         rpc.register(keyspace.TASK_LINES, self._kept.answer)
         await self.manager.start()
@@ -394,7 +416,7 @@ class Gateway:
             "session": self.plane.until_gone(),
             "retention": self._retention.run(),
             "copies of files": copies.run(),
-        }
+        } | ({"observer": observer.run()} if observer else {})
         for name, work in root_tasks.items():
             self._stack.push_async_callback(self.supervisor.start(name, work))
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
@@ -415,6 +437,32 @@ class Gateway:
         await self.learn.start(audit)
         self._stack.push_async_callback(self.learn.stop)
         return Retention(self.plane, self.config.tasks, artifacts, needed=self.learn.needed)
+
+    def _start_telling(self) -> "Observer | None":
+        """Publish log lines; returns what tells monitoring systems, whose packages are loaded only where that is on."""
+        config = self.config
+        if config.observe.active:
+            from appliance.observe.observer import Observer  # noqa: PLC0415
+
+            self._observer = Observer(
+                config.observe, fleet=config.fleet, gateway=config.id, version=VERSION, facts=self._facts
+            )
+            self._stack.push_async_callback(self._observer.close)
+        logs.publish_to(self._put_log)
+        self._stack.callback(logs.publish_to, None)
+        return self._observer
+
+    async def _facts(self) -> Facts:
+        """What metrics are made of."""
+        return Facts(
+            status=self.status(),
+            containers=self.pool.containers(),
+            alerts=(await self._alerts.alerts(AlertsAsk(local=True))).alerts,
+            links=(await self.hub.links(LinksAsk())).links,
+            robots={robot.id: robot.online for robot in self.plane.registry.robots.values()},
+            gateways=len(self.plane.members()),
+            tasks=Counter(map(task_status, self.manager.records)),
+        )
 
     def _take_tasks(self, audit: Audit) -> None:
         """Take tasks from robots, and from the schedules that are this gateway's."""
@@ -598,6 +646,8 @@ class Gateway:
     def _put_log(self, line: LogLine) -> None:
         line = line if line.source else replace(line, source=self.config.id)
         self._kept.hear_log(line)
+        if self._observer is not None:
+            self._observer.hear_log(line)
         self.plane.session.put(self.plane.keys(keyspace.LOG, self.config.id), msgspec.json.encode(line))
 
     def _hear_recorder(self, _key: str, status: RecorderStatus | None) -> None:

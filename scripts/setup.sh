@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # Makes this machine able to run the appliance, from nothing but git, make and Python 3.11 on Debian.
 #
-#   scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-ray] [--with-flower] [--with-train] [--with-docs]
+#   scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-prometheus] [--with-ray] [--with-flower] [--with-train] [--with-docs]
 #
 # gateway: what a gateway and the demo need. dev: that, and the tools of `make test`. host: only the machine's part
 # (packages, user, ranges, Podman), for `make install`, which puts the program elsewhere. --with-browser: also Chromium
-# (300 MB), for the test of the terminal UI in a browser; where it cannot be had, that test says so. --with-ray: Ray, which
+# (300 MB), for the test of the terminal UI in a browser; where it cannot be had, that test says so. --with-prometheus:
+# likewise Prometheus' programs (19 MB), for the test of the dashboard; no service of it is started. --with-ray: Ray, which
 # benchmarks compare with; --with-flower: Flower, likewise (5 GB); --with-train: also PyTorch, for `swiftbot train`;
 # --with-docs: MkDocs; each in an environment of its own.
 # As root it sets up the service user and works for it; as a user it works in place and asks sudo for system packages
@@ -18,6 +19,7 @@ START=$(date +%s%N)
 MODE=gateway
 IMAGES=1
 WITH_BROWSER=
+WITH_PROMETHEUS=
 WITH_RAY=
 WITH_FLOWER=
 WITH_TRAIN=
@@ -27,12 +29,13 @@ for argument in "$@"; do
     gateway | dev | host) MODE=$argument ;;
     --without-images) IMAGES= ;;
     --with-browser) WITH_BROWSER=1 ;;
+    --with-prometheus) WITH_PROMETHEUS=1 ;;
     --with-ray) WITH_RAY=1 ;;
     --with-flower) WITH_FLOWER=1 ;;
     --with-train) WITH_TRAIN=1 ;;
     --with-docs) WITH_DOCS=1 ;;
     *)
-      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-ray] [--with-flower] [--with-train] [--with-docs])" >&2
+      echo "setup: unknown argument '$argument' (usage: scripts/setup.sh [gateway|dev|host] [--without-images] [--with-browser] [--with-prometheus] [--with-ray] [--with-flower] [--with-train] [--with-docs])" >&2
       exit 2
       ;;
   esac
@@ -149,6 +152,20 @@ install_browser() {
   say "chromium: installing it"
   (root "chromium" apt-get -q -y -o DPkg::Lock::Timeout=300 -o Acquire::Retries=3 install --no-install-recommends chromium) ||
     say "chromium: could not be had; going on"
+}
+
+# The same. Taken out of its package: installed, it would run as a service.
+take_prometheus() {
+  local out=$VENV/bin folder
+  if [ -z "$WITH_PROMETHEUS" ] || command -v prometheus >/dev/null || [ -x "$out/prometheus" ]; then return; fi
+  say "prometheus: taking it out of Debian's package"
+  folder=$(mktemp -d "$STATE/prometheus.XXXXXX")
+  if (cd "$folder" && apt-get -q -o Acquire::Retries=3 -o APT::Sandbox::User=root download prometheus && dpkg-deb -x prometheus_*.deb .) >"$LOG" 2>&1; then
+    install -m 0755 "$folder/usr/bin/prometheus" "$folder/usr/bin/promtool" "$out/"
+  else
+    say "prometheus: could not be had; going on"
+  fi
+  rm -rf "$folder"
 }
 
 check_python() {
@@ -473,6 +490,7 @@ if [ "$MODE" = host ]; then
 else
   copy_tree
   make_environment
+  take_prometheus
   install_package
   start_api
   if [ -n "$IMAGES" ]; then build_images; fi

@@ -32,6 +32,7 @@ SECTIONS = (
     ("tasks.detection", "appliance.tasks.settings", "DetectionConfig"),
     ("tasks.replan", "appliance.tasks.settings", "ReplanConfig"),
     ("tasks.migration", "appliance.tasks.settings", "MigrationConfig"),
+    ("observe", "appliance.observe.settings", "ObserveConfig"),
 )
 HEAD = """# Configuration
 

@@ -532,6 +532,11 @@ class TaskManager:
         return len(self._takeover.queue)
 
     @property
+    def records(self) -> tuple[TaskRecord, ...]:
+        """Their records as they are just now."""
+        return tuple(each.record for each in self._coordinators.values())
+
+    @property
     def findings(self) -> Mapping[str, int]:
         """What the watchdog and replanning found and did, by kind, since start."""
         return self.context.findings

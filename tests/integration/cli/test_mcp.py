@@ -50,7 +50,13 @@ def data_of(result: CallToolResult) -> Any:
     return json.loads(text[text.index("\n<data ") :].split("\n", 2)[2].rpartition("\n</data ")[0])
 
 
-async def test_an_assistant_submits_and_an_operator_approves(fleet: FleetState) -> None:
+async def test_an_assistant_on_a_fleet(fleet: FleetState, tmp_path: Path) -> None:
+    """One after the other on one fleet: submit, wait for an operator, succeed, over stdio; then the stop, over HTTP."""
+    await submit_and_approve(fleet)
+    await stop_over_http(fleet, tmp_path)
+
+
+async def submit_and_approve(fleet: FleetState) -> None:
     """Over stdio it looks, plans dry, submits: the plan waits, its name is on it, an operator approves, it succeeds."""
     server = StdioServerParameters(command=sys.executable, args=words(fleet), env=dict(os.environ))
     async with FleetClient(fleet.endpoint, operator="ann") as ann, Client(server, client_info=CLAUDE) as assistant:
@@ -96,7 +102,7 @@ async def test_an_assistant_submits_and_an_operator_approves(fleet: FleetState) 
         assert {each.verb for each in acts if each.by == "mcp:claude"} >= {"submit", "cancel"}
 
 
-async def test_an_assistant_stops_the_robots(fleet: FleetState, tmp_path: Path) -> None:
+async def stop_over_http(fleet: FleetState, tmp_path: Path) -> None:
     """Over HTTP the soft stop holds the robot; only an operator resumes it."""
     token = tmp_path / "token"
     process = await asyncio.create_subprocess_exec(
