@@ -9,6 +9,8 @@ from appliance.client import Endpoint, FleetClient
 from appliance.errors import DeadlineError, UnreachableError
 from appliance.model import TaskRecord, TaskRequest
 from appliance.model.keys import Verb
+from appliance.model.roles import Role
+from appliance.model.steering import MAX_BY
 
 pytestmark = pytest.mark.anyio
 
@@ -64,3 +66,13 @@ async def test_when_all_are_silent_it_is_said() -> None:
     with pytest.raises(DeadlineError, match="gw-3"):
         await client(wire).submit(TaskRequest(instruction="go home"))
     assert len(wire.asked) == 3
+
+
+def test_a_connection_acts_under_another_name_only_without_keys() -> None:
+    """With keys the name is the certificate's; the connection itself keeps its own name in any case."""
+    ann = FleetClient(Endpoint(fleet="f", connect=()), operator="ann")
+    assert ann.acting("mcp:claude").operator == "mcp:claude"
+    assert len(ann.acting("x" * 500).operator) == MAX_BY
+    assert ann.operator == "ann"
+    ann.role = Role.OPERATOR
+    assert ann.acting("mcp:claude").operator == "ann"

@@ -180,6 +180,29 @@ def test_what_is_followed_is_bounded() -> None:
     assert len(spans._tasks) == len(spans._runs) == 10
 
 
+STEPS = st.lists(
+    st.tuples(
+        st.sampled_from(TransitionKind), st.sampled_from(["", "s1", "s2", "s9"]), st.integers(0, 3), st.booleans()
+    ),
+    max_size=30,
+)
+
+
+@given(STEPS, st.sampled_from(TaskState))
+def test_no_order_of_events_breaks_it(steps: list[tuple[TransitionKind, str, int, bool]], state: TaskState) -> None:
+    """Whatever comes after whatever, spans end no earlier than they begin, and a task has one root, at its end."""
+    spans, found = Spans(), []
+    for at_s, (kind, subtask, attempt, waits) in enumerate(steps, start=2):
+        plan = PLAN if kind in (TransitionKind.PLANNED, TransitionKind.PROPOSED, TransitionKind.REPLANNED) else None
+        found += spans.of_transition(
+            event(kind, at_s, subtask=subtask, attempt=attempt, waits=waits, plan=plan)
+        )  # fmt: skip
+    found += spans.of_record(record(state, len(steps) + 2))
+    assert [span for span in found if span.end_ns < span.start_ns] == []
+    known = any(kind is not TransitionKind.HEALED for kind, *_ in steps)
+    assert sum(span.parent is None for span in found) == (known and state.final)
+
+
 TEXT = st.text(max_size=30)
 
 
