@@ -1037,7 +1037,11 @@ async def learn_start(
     there = tuple(sorted(name for name, robot in known.items() if robot.online))
     wanted = recipes.for_robots(wanted, chosen or there, recipe)
     started = await client.learn_start(f"{wanted.model}-{time.strftime('%m%d-%H%M%S')}", wanted, why=why)
-    return Outcome(value=started, text=f"run {started.id} started on {', '.join(started.recipe.names)}")
+    text = f"run {started.id} started on {', '.join(started.recipe.names)}"
+    # Nothing is built here, and on the machine of whom asks it would be of no use.
+    if not any("/learn:" in image for status in client.plane.registry.gateways.values() for image in status.images):
+        text += "; no gateway has image learn yet: swiftbot images build learn, on one of them"
+    return Outcome(value=started, text=text)
 
 
 @operation("learn why", title="Why", keys=("y",), screens=("run",), long=True)

@@ -2,7 +2,7 @@
 # pyright: basic, reportArgumentType=false, reportAttributeAccessIssue=false
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import msgspec
 import pytest
@@ -17,9 +17,12 @@ from appliance.model.learn_api import LearnShown
 from appliance.model.learning import (
     Activity,
     Model,
+    Recipe,
+    RunRecord,
     RunState,
 )
 from appliance.model.messages import enums_open
+from appliance.operations import learn_start
 from appliance.tui.app import SwiftbotApp
 from appliance.tui.ascii_terminal import in_ascii
 from appliance.tui.screens.learning import LearningScreen, RunScreen, client_cells, curves
@@ -34,6 +37,8 @@ from .learning_runs import ENDED, HISTORY, ROUND, RUN, STATUSES, fill, status
 from .pictures import settle
 
 if TYPE_CHECKING:
+    from appliance.client import FleetClient
+
     from .conftest import FakeView
 
 pytestmark = pytest.mark.anyio
@@ -168,7 +173,7 @@ async def test_an_instruction_to_train_shows_what_would_start_and_starts_it_when
     learning: "FakeView",
 ) -> None:
     """It is not planned: a question says recipe, robots and rounds; no starts nothing, yes starts the run on robots."""
-    learning.orders.plane = SimpleNamespace(registry=SimpleNamespace(robots=dict(learning.store.robots)))
+    learning.orders.plane = SimpleNamespace(registry=SimpleNamespace(robots=dict(learning.store.robots), gateways={}))
     learning.orders.answers["learn_start"] = RUN
     app = SwiftbotApp(learning, TuiConfig(write=True))
     async with app.run_test(size=SIZES[0]) as pilot:
@@ -303,3 +308,25 @@ def test_parts_that_others_train_are_told_of_their_client() -> None:
     """Of an offloaded client the reason begins with how many parts are elsewhere."""
     cells = client_cells(status("rover_1", Activity.TRAINING, parts=2, why="step 1/6"))
     assert cells[-1] == "2 parts elsewhere; step 1/6"
+
+
+@pytest.mark.parametrize("images", [(), ("localhost/swiftbot/base:0123",), ("localhost/swiftbot/learn:0123",)])
+async def test_a_run_that_no_gateway_can_train_says_what_to_build(images: tuple[str, ...]) -> None:
+    """The terminal UI builds no image: where no gateway has that of training, the answer has the command."""
+    gateways = {"gw-a": SimpleNamespace(images=images), "gw-b": SimpleNamespace(images=())}
+    robots = {"rover_1": SimpleNamespace(online=True)}
+
+    async def nothing() -> None:
+        return None
+
+    async def start(_: str, recipe: Recipe, **__: object) -> RunRecord:
+        return replace(RUN, recipe=recipe)
+
+    client = SimpleNamespace(
+        gateway=nothing,
+        learn_start=start,
+        plane=SimpleNamespace(registry=SimpleNamespace(robots=robots, gateways=gateways)),
+    )
+    outcome = await learn_start(cast("FleetClient", client), "clips")
+    assert outcome.text.startswith("run clips-1 started on rover_1")
+    assert ("swiftbot images build learn" in outcome.text) == (not any("/learn:" in image for image in images))
