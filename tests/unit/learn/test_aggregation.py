@@ -321,6 +321,7 @@ def test_noise_is_added_once_and_is_another_each_time() -> None:
     for _ in range(2):
         result, changes = aggregate(updates, clip=0.5, noise=3.0 * 1024)
         assert all(verdict.accepted for verdict in result.verdicts.values())
+        assert result.bound is None, "JSON has no infinity"
         seen.append(changes)
     noise = np.concatenate([(seen[0][name] - seen[1][name]).reshape(-1) for name in plain])
     assert noise.std() == pytest.approx(3.0 / 4 * math.sqrt(2), rel=0.1)

@@ -58,12 +58,12 @@ class Verdict(NamedTuple):
 
 
 class Result(NamedTuple):
-    """The shards of the new model as `keep` took them, and what became of each update."""
+    """The shards of the new model as `keep` took them, and what became of each update. No `bound`: none was used."""
 
     manifest: Manifest
     verdicts: dict[str, Verdict]
     weight: int
-    bound: float
+    bound: float | None
 
 
 class TooFewError(ValueError):
@@ -144,7 +144,8 @@ class Aggregator:
                 break
         for each in chosen:
             self._verdicts[each.client] = Verdict(accepted=True, norm=self._norms[each.client])
-        return Result(manifest, self._verdicts, sum(each.weight for each in chosen), bound)
+        told = bound if math.isfinite(bound) else None  # JSON has no infinity
+        return Result(manifest, self._verdicts, sum(each.weight for each in chosen), told)
 
     # --- what is summed
 
