@@ -16,7 +16,7 @@ import hashlib
 import re
 import time
 import uuid
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from typing import Any, Literal, TypedDict
 
 import msgspec
@@ -41,6 +41,7 @@ from appliance.model import (
     Lease,
     Notice,
     Plan,
+    RobotInfo,
     RobotReply,
     RunEvent,
     Site,
@@ -407,6 +408,10 @@ class SteeringCalls(FleetConnection):
     def knows_robot(self, name: str) -> bool:
         """Whether a robot of that name has been heard of here."""
         return name in self.plane.registry.robots
+
+    def known_robots(self) -> Mapping[str, RobotInfo]:
+        """Return the robots as they were heard last, by name."""
+        return self.plane.registry.robots
 
     async def stop(self, robots: Sequence[str] = (), *, why: str = "") -> StopAnswer:
         """Soft stop of some robots, or of the fleet: they hold, and are given no command until `resume_robots`.

@@ -9,6 +9,7 @@ Arguments are annotated with what they are (`TaskId`, `GatewayId`, ...): the ter
 from the selected row. An option annotated with a help text only is offered on the command line alone.
 """
 
+import asyncio
 import inspect
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -20,16 +21,18 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from appliance.after_stop import Left, Offer, bring_back, lefts, origin_of, put_down, robots_of
 from appliance.client import FleetClient, cancel_outcome, unknown_text
 from appliance.errors import NotFoundError, PayloadError, RefusedError, SwiftbotError
 from appliance.learn import tables
+from appliance.model import Plan, RobotInfo, Site, TaskRecord, TaskRequest
 from appliance.model.alerts import AlertsAcked
 from appliance.model.learning import MOST_ROUNDS, RunRecord
 from appliance.model.pool_api import Evicted, WarmAsk
 from appliance.model.robot_api import LEASE_S
 from appliance.model.roles import Role
 from appliance.model.steering import MAX_WHY
-from appliance.model.task_api import DrainState, MigrateAsk
+from appliance.model.task_api import DrainState, MigrateAsk, TasksAsk
 from appliance.reasons import time_of_day, why_text
 
 
@@ -314,7 +317,8 @@ OPERATIONS.append(
 async def cancel(client: FleetClient, task: TaskId, *, why: Why = "") -> Outcome:
     """Cancel a task."""
     record = await client.cancel(task, why=why)
-    return Outcome(value=record, text=cancel_outcome(record))
+    notes = left_lines(await left_of(client, robots_of(record), record=record), tui=True) if record.state.final else ()
+    return Outcome(value=record, text=cancel_outcome(record), notes=notes)
 
 
 @operation(
@@ -644,6 +648,139 @@ async def stop_these(client: FleetClient, robots: Sequence[str], why: str) -> Ou
     silent = f"; not confirmed by {', '.join(found.silent)}" if found.silent else ""
     text = f"soft stop of {', '.join(robots) or 'the fleet'}: {held}{problems}{silent}"
     return Outcome(value=found, text=text, ok=not (found.problems or found.silent))
+
+
+# --- after a cancel or a stop ------------------------------------------------------------------------------------
+
+_SITE_S = 2.0
+"""How long the site is waited for: without it the nearest place is not named."""
+_MOST_LEFT = 12
+"""Robots that are listed after a stop."""
+_PICKS = 50
+"""Latest tasks of a robot in which it is looked for where it picked up what it holds."""
+
+
+async def left_of(
+    client: FleetClient, names: Sequence[str], *, record: TaskRecord | None = None, stopped: bool = False
+) -> tuple[Left, ...]:
+    """Return where robots stand, what they hold and what can be done, as they were heard last.
+
+    Args:
+        client: connected.
+        names: of robots; those that are not known are left out.
+        record: the task that they worked for.
+        stopped: whether a soft stop holds them.
+    """
+    robots = client.known_robots()
+    if not any(name in robots for name in names):
+        return ()
+    return lefts(robots, names, record=record, site=await _site(client), stopped=stopped)
+
+
+async def _site(client: FleetClient) -> Site | None:
+    try:
+        async with asyncio.timeout(_SITE_S):
+            return await client.site()
+    except (SwiftbotError, TimeoutError):
+        return None
+
+
+def left_lines(found: Sequence[Left], *, tui: bool = False) -> tuple[str, ...]:
+    """Return a line for each robot: where it stands, what it holds, and the commands that are offered.
+
+    Args:
+        found: how robots stand.
+        tui: whether commands are those of the terminal UI.
+    """
+    lines = [f"{each.text}{_offers(each.offers, tui=tui)}" for each in found[:_MOST_LEFT]]
+    if len(found) > _MOST_LEFT:
+        lines.append(f"{len(found) - _MOST_LEFT} further robots: swiftbot robots")
+    return tuple(lines)
+
+
+def _offers(offers: Sequence[Offer], *, tui: bool) -> str:
+    if not offers:
+        return ""
+    by_function = {each.function.__name__: each for each in OPERATIONS if each.function is not None}
+    commands = [
+        f":{by_function[each.do].name} {each.on}" if tui else f"swiftbot {by_function[each.do].command} {each.on}"
+        for each in offers
+    ]
+    return f" → {' or '.join(commands)}"
+
+
+@operation(
+    "robots put-down",
+    title="Put down",
+    name="put-down",
+    keys=("d",),
+    screens=("robots", "robot"),
+    role=Role.OPERATOR,
+    danger="Have {robot} put down what it holds, where it stands? It is a task of its own.",
+    audit="submit",
+)
+async def put_down_here(client: FleetClient, robot: RobotId) -> Outcome:
+    """Have a robot put down what it holds, where it stands, as a task."""
+    info = _holder(client, robot)
+    return await _hand_in(client, put_down(info), f"{robot}: put the {info.holding} down here")
+
+
+@operation(
+    "robots bring-back",
+    title="Bring back",
+    name="bring-back",
+    keys=("b",),
+    screens=("robots", "robot"),
+    role=Role.OPERATOR,
+    danger="Have {robot} bring what it holds to {place}, and put it down there? It moves, as a task of its own.",
+    audit="submit",
+)
+async def bring_it_back(
+    client: FleetClient,
+    robot: RobotId,
+    *,
+    place: Annotated[
+        str, Kind("place", "Place; where it was picked up if not given.", absent="where it picked it up", rest=True)
+    ] = "",
+) -> Outcome:
+    """Have a robot bring back what it holds to where it picked it up, or to a place, as a task."""
+    info = _holder(client, robot)
+    site = await client.site()
+    if place and site.find(place) is None:
+        known = ", ".join(sorted(site.places))
+        raise NotFoundError(f"the site has no place {place[:60]!r}", remedy=f"places: {known[:400]}")
+    if not place:
+        # Also those of which only the outcome is kept: they name no place, and end nothing.
+        tasks = await client.tasks(_PICKS, wanted=TasksAsk(robot=robot))
+        things = {each.name.lower(): each.at for each in site.objects}
+        place = origin_of(tasks.tasks, robot, info.holding) or things.get(info.holding.lower(), "")
+    if not place:
+        raise RefusedError(
+            f"where {robot} picked up the {info.holding} is not known",
+            remedy=f"name the place: swiftbot robots bring-back {robot} --place PLACE",
+        )
+    return await _hand_in(client, bring_back(info, place, site), f"{robot}: bring the {info.holding} back to {place}")
+
+
+def _holder(client: FleetClient, robot: str) -> RobotInfo:
+    """Return a robot that holds something; an error says why it can put nothing down."""
+    info = client.known_robots().get(robot)
+    if info is None:
+        known = ", ".join(sorted(client.known_robots())) or "none"
+        raise NotFoundError(f"no robot {robot[:60]!r}", remedy=f"there are: {known[:400]}")
+    if not info.online:
+        raise RefusedError(f"{robot} is offline", remedy="wait until it is heard again")
+    if not info.holding:
+        raise RefusedError(f"{robot} holds nothing", remedy="`swiftbot robots` shows what robots hold")
+    if "place" not in info.verbs:
+        raise RefusedError(f"{robot} has no command to put things down", remedy="take what it holds out of its gripper")
+    return info
+
+
+async def _hand_in(client: FleetClient, plan: Plan, instruction: str) -> Outcome:
+    """Submit a plan whose every step the instruction says."""
+    record = await client.submit(TaskRequest(instruction=instruction, submitter=client.operator, plan=plan))
+    return Outcome(value=record, text=f"task {record.id} is accepted: {instruction}")
 
 
 async def stop_in_words(

@@ -3,7 +3,7 @@
 import inspect
 import os
 import sys
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -13,10 +13,11 @@ from cyclopts import App, Group, Parameter
 from cyclopts.validators import Number
 
 from appliance import console
+from appliance.after_stop import Left
 from appliance.client import Endpoint, FleetClient
 from appliance.errors import ConfigError, Exit
 from appliance.model import TaskRecord
-from appliance.operations import OPERATIONS, Annotation, Operation, annotations
+from appliance.operations import OPERATIONS, Annotation, Operation, annotations, left_lines
 from appliance.tasks.views import view
 
 DAEMONS = Group("Daemons", sort_key=3)
@@ -150,6 +151,12 @@ def on_terminal() -> bool:
 def show_task(record: TaskRecord, *, as_json: bool) -> None:
     """Print a task."""
     show(view(record), as_json=as_json, table=console.task_table(record))
+
+
+def tell_left(found: Sequence[Left]) -> None:
+    """Print where robots stand, what they hold and what can be done, a line each; nothing where there are none."""
+    for line in left_lines(found):
+        console.out.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def add_operations(app: App) -> None:

@@ -6,9 +6,10 @@ from collections.abc import Generator
 from cyclopts import App
 
 from appliance import console
-from appliance.cli.common import HERE, WORK, Json, Where, Why, show
+from appliance.cli.common import HERE, WORK, Json, Where, Why, show, tell_left
 from appliance.client import Stopped, answer_text
 from appliance.errors import Exit, SwiftbotError
+from appliance.operations import left_of
 
 
 def add_to(app: App) -> None:
@@ -28,7 +29,15 @@ async def stop(*robots: str, why: Why = "", as_json: Json = False, where: Where 
     with reported_unconfirmed():
         async with where.client() as client:
             done = await Stopped.carry_out(client, robots, why=why)
-    return show_stopped(done, as_json=as_json)
+            if as_json:
+                return show_stopped(done, as_json=True)
+            # At once: how they stand is told after that they do.
+            code = show_stopped(done, as_json=False)
+            # Of the fleet only those that hold something: the others are at rest, and `robots` lists them.
+            known = client.known_robots()
+            meant = done.robots or [name for name, each in sorted(known.items()) if each.holding]
+            tell_left(await left_of(client, meant if done.answer is not None else (), stopped=True))
+    return code
 
 
 @contextlib.contextmanager

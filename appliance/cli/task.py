@@ -17,14 +17,15 @@ from cyclopts.validators import Number
 from msgspec.structs import replace
 
 from appliance import console
-from appliance.cli.common import HERE, WORK, Json, Where, Why, json_line, show, show_task
+from appliance.after_stop import robots_of, unfinished
+from appliance.cli.common import HERE, WORK, Json, Where, Why, json_line, show, show_task, tell_left
 from appliance.cli.submit import exit_code
 from appliance.cli.times import since_ns
 from appliance.client import FleetClient, cancel_outcome, read_plan_file
 from appliance.errors import ConfigError, Exit, SwiftbotError
 from appliance.model import Plan, TaskRecord
 from appliance.model.task_api import MigrateAsk, Migrated, TasksAsk
-from appliance.operations import split_subtask
+from appliance.operations import left_of, split_subtask
 from appliance.tasks import history
 from appliance.tasks.views import STATUSES, view
 
@@ -234,7 +235,25 @@ async def task_cancel(task: str, /, *, why: Why = "", as_json: Json = False, whe
         console.err.print(cancel_outcome(record))
         async for record in client.watch(task):  # noqa: B007 - the last one is shown
             pass
+        left = await left_of(client, robots_of(record), record=record)
     show_task(record, as_json=as_json)
+    if not as_json:
+        tell_left(left)
+    return Exit.DONE
+
+
+@task_app.command(name="show")
+async def task_show(task: str, /, *, as_json: Json = False, where: Where = HERE) -> int:
+    """Show a task with its subtasks, or the plan that waits; of one that did not end well, how its robots stand now.
+
+    Args:
+        task: Task ID.
+    """
+    async with where.client() as client:
+        record = await client.task(task)
+        left = await left_of(client, robots_of(record), record=record) if unfinished(record) and not as_json else ()
+    show_task(record, as_json=as_json)
+    tell_left(left)
     return Exit.DONE
 
 

@@ -231,6 +231,7 @@ def about(robot: Robot, width: int = 0) -> Text:
         ("battery", charge, charge_style),
         ("position", f"{place(pose)} m east, north, up{heading}" if pose is not None else "not told", ""),
         ("mission", safe(robot.mission or "none", 120), ""),
+        ("holds", f"{safe(info.holding or 'nothing', 120)}{_ways_to_free(robot)}", ""),
         ("has", safe(", ".join(info.uses) or "not told", 200), ""),
         ("answers", safe(", ".join(info.verbs) or "not told", 300), ""),
     ]
@@ -248,6 +249,13 @@ def about(robot: Robot, width: int = 0) -> Text:
         out.append(f"? {safe(each.question, 300)}{choices}\n", "bold yellow")
         out.append(f"  `:answer {safe(each.id, 80)} TEXT` or the key of Answer; the first answer counts\n", "dim")
     return out
+
+
+def _ways_to_free(robot: Robot) -> str:
+    """Return how an idle robot gets rid of what it holds; empty where it cannot, or works."""
+    if not robot.info.holding or robot.mission or "place" not in robot.info.verbs:
+        return ""
+    return " → `:put-down` puts it down here, `:bring-back` where it was picked up"
 
 
 # --- the map -----------------------------------------------------------------------------------------------------

@@ -17,8 +17,12 @@ from appliance.model import (
     Approval,
     Decision,
     Failure,
+    Place,
     Plan,
+    Pose,
     Proposal,
+    RobotInfo,
+    Site,
     SoftStop,
     Subtask,
     SubtaskRecord,
@@ -40,6 +44,7 @@ class Fleet:
     def __init__(self) -> None:
         self.robots = dict.fromkeys(ROSTER)
         self.plane = SimpleNamespace(registry=SimpleNamespace(robots=self.robots))
+        self.known: dict[str, RobotInfo] = {}
         self.operator = "ann"
         self.stops: list[tuple[tuple[str, ...], str]] = []
         self.submitted: list[TaskRequest] = []
@@ -66,6 +71,14 @@ class Fleet:
         if self.gone:
             raise UnreachableError("no gateway of fleet local is there")
         return "gw-1"
+
+    def known_robots(self) -> dict[str, RobotInfo]:
+        """Return the robots as they are set."""
+        return self.known
+
+    async def site(self) -> Site:
+        """Return a map with one place."""
+        return Site(places={"dock 3": Place(x=10.0, y=4.0)})
 
     async def stop(self, robots: tuple[str, ...] = (), *, why: str = "") -> StopAnswer:
         """Keep the stop."""
@@ -200,6 +213,22 @@ def test_the_other_names_are_stopped(fleet: Fleet, swiftbot: Any) -> None:
     assert out.startswith("NOT STOPPED: no robot 'rover_7'")
     assert "rover_1: stopped by ann: a person\nhold: rover_1" in out
     assert out.rstrip().endswith("to stop all robots: swiftbot stop")
+
+
+def test_a_stop_says_where_robots_stand_and_what_they_hold(fleet: Fleet, swiftbot: Any) -> None:
+    """After what is confirmed: of those that were named each, of the whole fleet those that hold something."""
+    fleet.known = {
+        "rover_1": RobotInfo(id="rover_1", kind="zenoh", pose=Pose(x=10.0, y=3.0), holding="red box", verbs=("place",)),
+        "rover_2": RobotInfo(id="rover_2", kind="zenoh"),
+    }
+    code, out, _ = swiftbot("stop")
+    assert code == 0
+    line = "rover_1 stands at 10.0 3.0 0.0 m (1.0 m from dock 3) and holds the red box → swiftbot resume rover_1"
+    assert out.splitlines()[-1] == line
+    assert out.index("hold: ") < out.index("stands at")
+    assert "rover_2 stands" not in out
+    _, out, _ = swiftbot("stop", "rover_2")
+    assert out.splitlines()[-1] == "rover_2 stands somewhere and holds nothing → swiftbot resume rover_2"
 
 
 def test_what_did_not_confirm_comes_first(fleet: Fleet, swiftbot: Any) -> None:

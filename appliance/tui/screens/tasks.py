@@ -14,9 +14,11 @@ from textual import on, work
 from textual.app import ComposeResult
 from textual.widgets import Static
 
+from appliance.after_stop import Left, left, robots_of, unfinished
 from appliance.errors import SwiftbotError
 from appliance.model import SubtaskState, TaskRecord
 from appliance.model.task_api import Line, TasksAsk, TaskWhy
+from appliance.operations import left_lines
 from appliance.tasks.views import why
 from appliance.tui import status_styles, task_view
 from appliance.tui.actions import bindings
@@ -67,7 +69,7 @@ class TaskScreen(FleetScreen):
 
     scope = "task"
     tab = "tasks"
-    shows = ("tasks",)
+    shows = ("tasks", "robots", "stops")
     BINDINGS = bindings("task")
 
     def __init__(self, task: str) -> None:
@@ -160,7 +162,19 @@ class TaskScreen(FleetScreen):
             out.append(f"\n… {text}", "yellow")
         if record.failure is not None:
             out.append(f"\n✘ {told(record.failure)}", "red")
+        if unfinished(record):
+            for line in left_lines(self._robots_left(record), tui=True):
+                out.append(f"\n▸ {safe(line, 400)}", "cyan")
         return out
+
+    def _robots_left(self, record: TaskRecord) -> tuple[Left, ...]:
+        """Return how the robots of a task that did not end well stand now."""
+        stops = self.store.stops
+        return tuple(
+            left(robot, record=record, stopped=stops.of(name) is not None)
+            for name in robots_of(record)
+            if (robot := self.store.robots.get(name)) is not None
+        )
 
     @on(Grid.Moved)
     def _draw_detail(self) -> None:

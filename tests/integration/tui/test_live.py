@@ -134,6 +134,7 @@ async def _see(app: SwiftbotApp, pilot: Pilot[None], *wanted: str | Callable[[st
 async def test_fleet_and_pool_are_live(gateway: Gateway, app: SwiftbotApp) -> None:
     """Gateways, containers and robots put on their keys are on the screens, limits not enforced among them."""
     async with app.run_test(size=(80, 24)) as pilot:
+        await pilot.press("1")
         await _see(app, pilot, "gw-a", "25%", "1/1", "limits are not enforced", "f1 · 1 gw · 1 robot")
         await pilot.press("3")
         await _see(app, pilot, "r1", "zenoh")

@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 from moving_bench import counting
 
+from appliance.after_stop import robots_of
 from appliance.client import FleetClient
 from appliance.connection import FleetState
-from appliance.model import Approval, ContainerState, RobotInfo, TaskRequest, TaskState
+from appliance.errors import RefusedError
+from appliance.model import Approval, ContainerState, Plan, RobotInfo, Subtask, TaskRequest, TaskState
+from appliance.operations import left_of, put_down_here
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
@@ -104,6 +107,47 @@ async def test_stop_and_resume_the_fleet(ann: Operator, client: FleetClient) -> 
     await ann.press("3", "Z")
     await confirm(ann, "Lift the soft stops of all robots?")
     await ann.until_true(lambda: _stops(client, 0))
+
+
+@does("cancel", "put-down", "bring-back")
+async def test_what_a_cancelled_task_leaves_is_put_down_or_brought_back(ann: Operator, client: FleetClient) -> None:
+    """A robot that holds something says so on its task and in the CLI's words, puts it down here, or brings it back."""
+    fetch = "rover_1: go to dock 1, pick up the blue box, go to dock 2"
+    await ann.line(f"submit {fetch}")
+    await ann.see("Instruction")
+    await ann.press("enter")
+    await ann.see("Enter runs this plan")
+    await ann.press("enter")
+    await ann.until(lambda: "task" in ann.chosen)
+    task = ann.chosen["task"]
+    await ann.until(lambda: rover(client).holding == "blue box")
+    await ann.line(f"cancel {task} wrong box")
+    await confirm(ann, f"Cancel task {task}?")
+    await record_of(client, task, final)
+    await ann.press("2", "enter")
+    await ann.see("rover_1 stands at", "holds the blue box", ":put-down rover_1", f":retry {task}")
+    (found,) = await left_of(client, robots_of(await client.task(task)), record=await client.task(task))
+    assert (found.holding, found.offers[1].do) == ("blue box", "bring_it_back")
+
+    await ann.line("bring-back rover_1")
+    await confirm(ann, "Have rover_1 bring what it holds to where it picked it up")
+    await ann.until(lambda: not rover(client).holding)
+    (newest, *_) = (await client.tasks(1)).tasks
+    record = await record_of(client, newest.id, final)
+    assert record.state is TaskState.SUCCEEDED, record.failure
+    assert [each.subtask.params["place"] for each in record.subtasks if each.subtask.skill == "goto"] == ["dock 1"]
+
+    pick = Subtask(id="s1", skill="pick", robot="rover_1", params={"object": "blue box"})
+    plan = Plan(domain="manipulation", subtasks=(pick,))
+    await client.submit(TaskRequest(instruction="pick it up", id="t-pick", plan=plan))
+    await ann.until(lambda: rover(client).holding == "blue box")
+    await ann.press("3", "home")
+    await ann.until(lambda: ann.chosen.get("robot") == "rover_1")
+    await ann.press("d")
+    await confirm(ann, "Have rover_1 put down what it holds")
+    await ann.until(lambda: not rover(client).holding)
+    with pytest.raises(RefusedError, match="rover_1 holds nothing"):
+        await put_down_here(client, "rover_1")
 
 
 async def _stops(client: FleetClient, count: int) -> bool:
