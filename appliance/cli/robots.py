@@ -17,6 +17,7 @@ from rich.table import Table
 
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, Why, fields, show
+from appliance.cli.drive import robots_drive
 from appliance.cli.times import until_of
 from appliance.client import FleetClient
 from appliance.errors import ConfigError, ConflictError, Exit, NotFoundError, RefusedError, SwiftbotError
@@ -33,6 +34,7 @@ robots_app.command(links_app)
 
 def add_to(app: App) -> None:
     """Add these commands."""
+    robots_app.command(robots_drive, name="drive")
     app.command(robots_app)
 
 

@@ -112,14 +112,16 @@ async def test_stop_and_resume_the_fleet(ann: Operator, client: FleetClient) -> 
 @does("cancel", "put-down", "bring-back")
 async def test_what_a_cancelled_task_leaves_is_put_down_or_brought_back(ann: Operator, client: FleetClient) -> None:
     """A robot that holds something says so on its task and in the CLI's words, puts it down here, or brings it back."""
-    fetch = "rover_1: go to dock 1, pick up the blue box, go to dock 2"
-    await ann.line(f"submit {fetch}")
-    await ann.see("Instruction")
-    await ann.press("enter")
-    await ann.see("Enter runs this plan")
-    await ann.press("enter")
-    await ann.until(lambda: "task" in ann.chosen)
-    task = ann.chosen["task"]
+    task = "t-left"
+    steps = [("goto", {"place": "dock 1"}), ("pick", {"object": "blue box"})]
+    steps += [("goto", {"place": place}) for place in ("dock 3", "dock 1") * 5]
+    chain = tuple(
+        Subtask(id=f"s{n}", skill=skill, robot="rover_1", params=dict(params), after=(f"s{n - 1}",) if n else ())
+        for n, (skill, params) in enumerate(steps)
+    )
+    await client.submit(
+        TaskRequest(instruction="fetch the blue box", id=task, plan=Plan(domain="manipulation", subtasks=chain))
+    )
     await ann.until(lambda: rover(client).holding == "blue box")
     await ann.line(f"cancel {task} wrong box")
     await confirm(ann, f"Cancel task {task}?")

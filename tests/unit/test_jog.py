@@ -5,7 +5,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.tui.screens.takeover import FIRST_S, IDLE_S, LASTS_S, NEXT_S, SEND_S, Holding
+from appliance.jog import FIRST_S, IDLE_S, LASTS_S, NEXT_S, SEND_S, Holding
 
 
 def run(holding: Holding, keys: dict[float, str], until: float, step: float = 0.05) -> list[tuple[float, str]]:
