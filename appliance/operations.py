@@ -10,9 +10,11 @@ from the selected row. An option annotated with a help text only is offered on t
 """
 
 import asyncio
+import contextlib
 import inspect
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from datetime import datetime
 from typing import Annotated, Any, TypeVar, get_args
 
 from msgspec import Meta, Struct
@@ -23,7 +25,7 @@ from rich.text import Text
 
 from appliance.after_stop import Left, Offer, bring_back, lefts, origin_of, put_down, robots_of
 from appliance.client import FleetClient, cancel_outcome, unknown_text
-from appliance.errors import NotFoundError, PayloadError, RefusedError, SwiftbotError
+from appliance.errors import ConfigError, NotFoundError, PayloadError, RefusedError, SwiftbotError
 from appliance.learn import tables
 from appliance.model import Plan, RobotInfo, Site, TaskRecord, TaskRequest
 from appliance.model.alerts import AlertsAcked
@@ -31,9 +33,13 @@ from appliance.model.learning import MOST_ROUNDS, RunRecord
 from appliance.model.pool_api import Evicted, WarmAsk
 from appliance.model.robot_api import LEASE_S
 from appliance.model.roles import Role
+from appliance.model.schedules import ScheduleSpec
 from appliance.model.steering import MAX_WHY
 from appliance.model.task_api import DrainState, MigrateAsk, TasksAsk
 from appliance.reasons import time_of_day, why_text
+from appliance.schedules import due
+from appliance.schedules.records import made_name
+from appliance.times import duration_s, moment_ns, until_of
 
 
 class Outcome(Struct, frozen=True, kw_only=True):
@@ -882,47 +888,153 @@ def acked_text(found: AlertsAcked) -> str:
     return "\n".join(lines)
 
 
-# --- places and robots out of use: commands; the terminal UI shows them ---------------------------------------------
+# --- places and robots out of use ----------------------------------------------------------------------------------
 
 PlaceName = Annotated[str, Kind("place", "Place of the site, by its name or an alias.")]
+UntilWhy = Annotated[
+    str, Kind("text", "When it ends by itself (2h, 14:00) if it does, then the reason.", rest=True, absent="")
+]
 
 
-@operation("place open", name="", role=Role.OPERATOR, audit="place_open")
+@operation(
+    "place close",
+    name="close-place",
+    title="Close place",
+    keys=("c",),
+    screens=("schedules",),
+    role=Role.OPERATOR,
+    danger="Close {place}? No plan goes there, and subtasks that have not begun wait until it is open.",
+    audit="place_close",
+)
+async def close_place(client: FleetClient, place: PlaceName, *, why: UntilWhy = "") -> Outcome:
+    """Close a place: no plan goes there, and subtasks that have not begun wait until it is open."""
+    until_ns, reason = until_and_why(why)
+    found = await client.close_place(place, until_ns=until_ns, why=reason)
+    return Outcome(value=found, text=f"{found.name} is {found.text}")
+
+
+@operation(
+    "place open", name="open-place", title="Open place", keys=("o",), screens=("schedules",), role=Role.OPERATOR,
+    danger="Open {place}? Tasks that wait for it continue.", audit="place_open",
+)  # fmt: skip
 async def place_open(client: FleetClient, place: PlaceName, *, why: Why = "") -> Outcome:
     """Open a closed place: tasks that wait for it continue."""
     found = await client.reopen("place", place, why=why)
     return Outcome(value=found, text=f"{found.name} is open; it was {found.text}")
 
 
-OPERATIONS.extend(
-    Operation(name="", command=command, help=text, role=Role.OPERATOR, audit=audit)
-    for command, text, audit in (
-        ("place close", "Close a place", "place_close"),
-        ("robots maintain", "Take a robot into maintenance", "robot_maintain"),
-    )
+@operation(
+    "robots maintain",
+    name="maintain",
+    title="Maintenance",
+    keys=("m",),
+    screens=("robots", "robot"),
+    role=Role.OPERATOR,
+    danger="Take {robot} into maintenance? No plan uses it and no task commands it until that ends.",
+    audit="robot_maintain",
 )
+async def maintain(client: FleetClient, robot: RobotId, *, why: UntilWhy = "") -> Outcome:
+    """Take a robot into maintenance: no plan uses it and no task commands it."""
+    until_ns, reason = until_and_why(why)
+    found = await client.maintain(robot, until_ns=until_ns, why=reason)
+    return Outcome(value=found, text=f"{found.name} is {found.text}")
 
-# --- schedules and saved instructions: commands; the terminal UI has none of them yet -------------------------------
+
+@operation(
+    "",
+    title="End maintenance",
+    keys=("e",),
+    screens=("robots", "robot", "schedules"),
+    role=Role.OPERATOR,
+    danger="End the maintenance of {robot}? Tasks may command it again.",
+    audit="robot_maintain_end",
+    footer=False,
+)
+async def end_maintenance(client: FleetClient, robot: RobotId, *, why: Why = "") -> Outcome:
+    """End a robot's maintenance: tasks may command it again."""
+    found = await client.reopen("robot", robot, why=why)
+    return Outcome(value=found, text=f"{found.name} is in use again; it was {found.text}")
+
+
+def until_and_why(text: str) -> tuple[int, str]:
+    """Return the moment that a reason begins with, Unix nanoseconds or 0 for none, and the reason without it."""
+    first, _, rest = text.strip().partition(" ")
+    if first[:1].isdigit():
+        with contextlib.suppress(ConfigError):
+            return until_of(first), rest.strip()
+    return 0, text.strip()
+
+
+# --- schedules and saved instructions --------------------------------------------------------------------------------
 
 ScheduleName = Annotated[str, Kind("schedule", "Schedule, as `swiftbot schedule list` shows it.")]
 InstructionName = Annotated[str, Kind("text", "Saved instruction, as `swiftbot instructions list` shows it.")]
+When = Annotated[str, Kind("text", "Interval such as 10m or 1h30m, or the one time, such as 17:00.")]
+Instruction = Annotated[str, Kind("text", "Instruction; it is planned and reviewed each time.", rest=True)]
+
+OPERATIONS.append(
+    Operation(
+        name="schedules",
+        command="schedule list",
+        title="Schedules",
+        help="Show the schedules, the closed places and the robots in maintenance",
+        keys=("S",),
+        call="schedules",
+    )
+)
 
 
-@operation("schedule pause", name="", role=Role.OPERATOR, audit="schedule_pause")
+@operation(
+    "schedule add",
+    title="New",
+    keys=("n",),
+    screens=("schedules",),
+    role=Role.OPERATOR,
+    danger="Add a schedule, {when}: {instruction}? The fleet submits it by itself, planned and reviewed each time.",
+    audit="schedule_add",
+)
+async def schedule_add(client: FleetClient, when: When, instruction: Instruction) -> Outcome:
+    """Add a schedule: an interval such as 10m, or one time such as 17:00, and the instruction."""
+    zone = due.local_zone()
+    now = datetime.now(due.zone_of(zone))
+    every_s = duration_s(when)
+    at_ns = moment_ns(when, now=now, option="WHEN", ahead=True) if every_s is None else 0
+    spec = ScheduleSpec(
+        id=made_name(instruction), instruction=instruction, every_s=every_s or 0.0, at_ns=at_ns, zone=zone
+    )
+    due.check(spec, now_ns=time.time_ns())
+    await client.plan(instruction)  # so that one that cannot run is refused at once
+    added = await client.schedule_add(spec)
+    return Outcome(value=added, text=f"schedule {added.id}, {due.times_text(added.spec)}: {instruction}")
+
+
+@operation(
+    "schedule pause", title="Pause", keys=("p",), screens=("schedules",), role=Role.OPERATOR, audit="schedule_pause"
+)
 async def schedule_pause(client: FleetClient, schedule: ScheduleName, *, why: Why = "") -> Outcome:
     """Pause a schedule: nothing is submitted, and nothing counts as missed, until it is resumed."""
     found = await client.schedule_steer(schedule, "pause", why=why)
     return Outcome(value=found, text=f"schedule {found.id} is paused")
 
 
-@operation("schedule resume", name="", role=Role.OPERATOR, audit="schedule_resume")
+@operation(
+    "schedule resume", title="Resume", keys=("r",), screens=("schedules",), role=Role.OPERATOR, audit="schedule_resume"
+)
 async def schedule_resume(client: FleetClient, schedule: ScheduleName, *, why: Why = "") -> Outcome:
     """Resume a paused schedule."""
     found = await client.schedule_steer(schedule, "resume", why=why)
     return Outcome(value=found, text=f"schedule {found.id} is active")
 
 
-@operation("schedule remove", name="", role=Role.OPERATOR, audit="schedule_remove")
+@operation(
+    "schedule remove",
+    title="Remove",
+    keys=("x",),
+    screens=("schedules",),
+    role=Role.OPERATOR,
+    danger="Remove schedule {schedule}? Nothing more of it is submitted; a task of it that has begun goes on.",
+    audit="schedule_remove",
+)
 async def schedule_remove(client: FleetClient, schedule: ScheduleName, *, why: Why = "") -> Outcome:
     """Remove a schedule; a task of it that has begun goes on."""
     found = await client.schedule_steer(schedule, "remove", why=why)
@@ -936,11 +1048,13 @@ async def instructions_remove(client: FleetClient, name: InstructionName, *, why
     return Outcome(value=found, text=f"removed {found.id}: {found.text[:120]}")
 
 
-OPERATIONS.extend(
-    Operation(name="", command=command, help=text, role=Role.OPERATOR, audit=audit)
-    for command, text, audit in (
-        ("schedule add", "Add a schedule of an instruction", "schedule_add"),
-        ("instructions save", "Save an instruction with parameters", "instruction_save"),
+OPERATIONS.append(
+    Operation(
+        name="",
+        command="instructions save",
+        help="Save an instruction with parameters",
+        role=Role.OPERATOR,
+        audit="instruction_save",
     )
 )
 

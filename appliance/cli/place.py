@@ -8,8 +8,8 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.cli.common import HERE, WORK, Json, Where, Why, show
-from appliance.cli.times import until_of
 from appliance.errors import Exit
+from appliance.times import until_of
 
 place_app = App(name="place", help="List the places of the site, close and open them.", group=WORK)
 

@@ -18,7 +18,6 @@ from rich.table import Table
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, Why, fields, show
 from appliance.cli.drive import robots_drive
-from appliance.cli.times import until_of
 from appliance.client import FleetClient
 from appliance.errors import ConfigError, ConflictError, Exit, NotFoundError, RefusedError, SwiftbotError
 from appliance.model import Lease, RobotInfo, SubtaskState, TaskState
@@ -26,6 +25,7 @@ from appliance.model.keys import check_name
 from appliance.model.robot_api import LinkAdd, LinkFacts, LinkList, LinkRemove, MavlinkLink, RobotForget, Standing
 from appliance.robots.authority.soft_stop import Stops
 from appliance.robots.conformance import Conformance, Operator, Seen, is_present
+from appliance.times import until_of
 
 robots_app = App(name="robots", help="List robots, take them over, check them, manage MAVLink links.", group=WORK)
 links_app = App(name="links", help="List, add and remove the MAVLink links of gateways.")

@@ -1,10 +1,6 @@
 """Schedules: `swiftbot schedule …`. `pause`, `resume` and `remove` are made from the registry of operations."""
 
-import contextlib
-import os
-import re
 from datetime import datetime
-from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
@@ -15,18 +11,17 @@ from rich.text import Text
 from appliance import console
 from appliance.cli.common import HERE, WORK, Json, Where, Why, show
 from appliance.cli.instructions import instruction_of
-from appliance.cli.times import duration_s, moment_ns
 from appliance.client import FleetClient
-from appliance.errors import ConfigError, Exit, PlanError, SwiftbotError
+from appliance.errors import ConfigError, Exit, PlanError
 from appliance.model import PLAIN_PRIORITY, Approval
 from appliance.model.schedules import Schedule, ScheduleShown, ScheduleSpec
-from appliance.schedules import due
-from appliance.schedules.records import MAX_NAME, no_schedule
+from appliance.schedules import due, records
+from appliance.schedules.records import no_schedule
+from appliance.times import duration_s, moment_ns
 
 schedule_app = App(
     name="schedule", help="Submit instructions at times: by interval, cron expression, once.", group=WORK
 )
-LOCALTIME = Path("/etc/localtime")
 
 
 def add_to(app: App) -> None:
@@ -81,13 +76,14 @@ async def schedule_add(
         raise ConfigError("it is not said when", remedy="give --every, --cron, --at or --in")
     if values and not saved:
         raise ConfigError(f"{values[0][:60]!r} follows the instruction", remedy="write the instruction in quotes")
-    place = zone or local_zone()
+    place = zone or due.local_zone()
     zone_info = due.zone_of(place)
     now = datetime.now(zone_info)
     async with where.client() as client:
         text = await instruction_of(client, saved, values) if saved else instruction
         spec = ScheduleSpec(
-            id=name or made_name(saved or text), instruction=text, every_s=_seconds("--every", every) if every else 0.0,
+            id=name or records.made_name(saved or text), instruction=text,
+            every_s=_seconds("--every", every) if every else 0.0,
             cron=cron, at_ns=_once(at, after, now), zone=place,
             until_ns=moment_ns(until, now=now, option="--until", ahead=True) if until else 0, late=late,
             grace_s=_seconds("--grace", grace), overlap=overlap, priority=priority, deadline_s=deadline, group=group,
@@ -129,24 +125,6 @@ def _seconds(option: str, text: str) -> float:
     return seconds
 
 
-def made_name(text: str) -> str:
-    """Return a name made of the first words of an instruction."""
-    words = re.sub(r"[^a-z0-9_]+", "-", text.casefold()).strip("-")[:MAX_NAME].rstrip("-")
-    return words or "schedule"
-
-
-def local_zone() -> str:
-    """Return the IANA name of this machine's time zone; UTC where it has none that is known."""
-    names = [os.environ.get("TZ", "").removeprefix(":")]
-    with contextlib.suppress(OSError):
-        names.append(str(LOCALTIME.resolve()).partition("/zoneinfo/")[2])
-    for name in filter(None, names):
-        with contextlib.suppress(SwiftbotError):
-            due.zone_of(name)
-            return name
-    return "UTC"
-
-
 async def _found(client: FleetClient, name: str) -> ScheduleShown:
     found = await client.schedules()
     shown = next((each for each in found.schedules if each.schedule.id == name), None)
@@ -183,23 +161,6 @@ async def schedule_show(schedule: str, /, *, as_json: Json = False, where: Where
     return Exit.DONE
 
 
-def times_text(spec: ScheduleSpec) -> str:
-    """Return when a schedule is due, in words."""
-    if spec.every_s:
-        return f"every {_duration(spec.every_s)}"
-    return f"{spec.cron} {spec.zone}" if spec.cron else f"at {due.when(spec.at_ns, spec.zone)}"
-
-
-def _duration(seconds: float) -> str:
-    parts: list[str] = []
-    left = int(seconds)
-    for unit, size in (("d", 86_400), ("h", 3600), ("m", 60), ("s", 1)):
-        count, left = divmod(left, size)
-        if count:
-            parts.append(f"{count}{unit}")
-    return "".join(parts) or f"{seconds:g}s"
-
-
 def schedule_table(shown: tuple[ScheduleShown, ...]) -> Table:
     """Schedules, a line each."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
@@ -208,7 +169,7 @@ def schedule_table(shown: tuple[ScheduleShown, ...]) -> Table:
     for each in shown:
         schedule = each.schedule
         table.add_row(
-            schedule.id, times_text(schedule.spec), _next(each), str(schedule.fired),
+            schedule.id, due.times_text(schedule.spec), _next(each), str(schedule.fired),
             Text(str(schedule.missed), style="yellow" if schedule.missed else ""), schedule.task or "–",
             schedule.spec.instruction,
         )  # fmt: skip
@@ -228,7 +189,7 @@ def schedule_text(shown: ScheduleShown) -> str:
     schedule: Schedule = shown.schedule
     spec = schedule.spec
     why = f": {schedule.added.why}" if schedule.added.why else ""
-    lines = [f"{schedule.id}: {spec.instruction}", f"  when      {times_text(spec)}"]
+    lines = [f"{schedule.id}: {spec.instruction}", f"  when      {due.times_text(spec)}"]
     if spec.until_ns:
         lines.append(f"  until     {due.when(spec.until_ns, spec.zone)}")
     lines.append(f"  added by  {schedule.added.by}{why}")
@@ -243,5 +204,5 @@ def schedule_text(shown: ScheduleShown) -> str:
             f"  missed    {schedule.missed}, the last {due.when(schedule.missed_ns, spec.zone)}: {schedule.missed_why}"
         )
     late = "an alert, and the last one is run late" if spec.late == "run" else "an alert"
-    lines.append(f"  missed is {late}; on time within {_duration(spec.grace_s)}; overlap: {spec.overlap}")
+    lines.append(f"  missed is {late}; on time within {due.interval_text(spec.grace_s)}; overlap: {spec.overlap}")
     return "\n".join(lines)

@@ -20,7 +20,6 @@ from appliance import console
 from appliance.after_stop import robots_of, unfinished
 from appliance.cli.common import HERE, WORK, Json, Where, Why, json_line, show, show_task, tell_left
 from appliance.cli.submit import exit_code
-from appliance.cli.times import since_ns
 from appliance.client import FleetClient, cancel_outcome, read_plan_file
 from appliance.errors import ConfigError, Exit, SwiftbotError
 from appliance.model import Plan, TaskRecord
@@ -28,6 +27,7 @@ from appliance.model.task_api import MigrateAsk, Migrated, TasksAsk
 from appliance.operations import left_of, split_subtask
 from appliance.tasks import history
 from appliance.tasks.views import STATUSES, view
+from appliance.times import since_ns
 
 task_app = App(name="task", help="List, show, watch, move and cancel tasks, and decide on their plans.", group=WORK)
 

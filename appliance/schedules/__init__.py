@@ -4,5 +4,6 @@
 `records` are their keys and which version stands after a partition; `manager` submits the tasks of the schedules whose
 records this gateway owns, and answers for both.
 
-Doors: `manager.ScheduleManager`, `due.check`, `due.upcoming`, `due.when`, `instructions`, `records.resolve`.
+Doors: `manager.ScheduleManager`, `due.check`, `due.upcoming`, `due.when`, `due.times_text`, `due.local_zone`,
+`instructions`, `records.resolve`, `records.made_name`.
 """

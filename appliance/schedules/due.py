@@ -9,18 +9,22 @@ What is due at the same moment has the same name on every gateway (`task_id`), s
 is submitted.
 """
 
+import contextlib
+import os
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta, tzinfo
 from functools import lru_cache
 from itertools import islice
+from pathlib import Path
 from zoneinfo import ZoneInfo
 
 from cronsim import CronSim, CronSimError
 from msgspec import Struct
 
-from appliance.errors import PayloadError
+from appliance.errors import PayloadError, SwiftbotError
 from appliance.model.schedules import SHORTEST_S, Schedule, ScheduleSpec
 
+LOCALTIME = Path("/etc/localtime")
 MOST_LOOKED_AT = 2000
 """Times that are counted one by one after a long absence; what was due beyond them is passed over."""
 END_GRACE_NS = 60 * 10**9
@@ -233,3 +237,33 @@ def step(schedule: Schedule, now_ns: int, *, busy: str = "", failed: str = "") -
 
 
 _ABSENT = "no gateway that has the schedule was running, or its clock was set"
+
+
+def times_text(spec: ScheduleSpec) -> str:
+    """Return when a schedule is due, in words."""
+    if spec.every_s:
+        return f"every {interval_text(spec.every_s)}"
+    return f"{spec.cron} {spec.zone}" if spec.cron else f"at {when(spec.at_ns, spec.zone)}"
+
+
+def interval_text(seconds: float) -> str:
+    """Return a duration as it is typed, such as 1h30m."""
+    parts: list[str] = []
+    left = int(seconds)
+    for unit, size in (("d", 86_400), ("h", 3600), ("m", 60), ("s", 1)):
+        count, left = divmod(left, size)
+        if count:
+            parts.append(f"{count}{unit}")
+    return "".join(parts) or f"{seconds:g}s"
+
+
+def local_zone() -> str:
+    """Return the IANA name of this machine's time zone; UTC where it has none that is known."""
+    names = [os.environ.get("TZ", "").removeprefix(":")]
+    with contextlib.suppress(OSError):
+        names.append(str(LOCALTIME.resolve()).partition("/zoneinfo/")[2])
+    for name in filter(None, names):
+        with contextlib.suppress(SwiftbotError):
+            zone_of(name)
+            return name
+    return "UTC"

@@ -4,6 +4,7 @@ Of a schedule what its operators changed last stands, a removal above all; up to
 both, so that nothing is submitted again that either side has submitted. Of a saved instruction the one saved last.
 """
 
+import re
 from typing import TypeVar
 
 import msgspec
@@ -102,3 +103,9 @@ def _saved(one: bytes, other: bytes) -> bytes:
         return (saved.at_ns if saved is not None else 0), value
 
     return max(one, other, key=rank)
+
+
+def made_name(text: str) -> str:
+    """Return a name made of the first words of an instruction."""
+    words = re.sub(r"[^a-z0-9_]+", "-", text.casefold()).strip("-")[:MAX_NAME].rstrip("-")
+    return words or "schedule"

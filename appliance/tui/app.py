@@ -53,6 +53,7 @@ from appliance.tui.screens.overview import OverviewScreen
 from appliance.tui.screens.replay import ReplayScreen
 from appliance.tui.screens.review import ReviewScreen
 from appliance.tui.screens.robots import RobotScreen, RobotsScreen
+from appliance.tui.screens.schedules import SchedulesScreen
 from appliance.tui.screens.submit import History, SubmitDialog, default_file
 from appliance.tui.screens.takeover import TakeoverScreen
 from appliance.tui.screens.tasks import TaskScreen, TasksScreen
@@ -123,7 +124,8 @@ class OperationProvider(Provider):
 
 
 def _palette_help(operation: Operation) -> str:
-    return f"{operation.help} ({shown(operation)})" if operation.keys else operation.help
+    keys = f" ({shown(operation)})" if operation.keys else ""
+    return f"{operation.help}{keys} · {operation.role}"
 
 
 class SwiftbotApp(App[None], inherit_bindings=False):
@@ -473,6 +475,11 @@ class SwiftbotApp(App[None], inherit_bindings=False):
         """Show the alerts, over whatever is seen."""
         if not isinstance(self.screen, AlertsScreen):
             self.push_screen(AlertsScreen())
+
+    def do_schedules(self, _given: Mapping[str, str]) -> None:
+        """Show schedules and what is out of use, over whatever is seen."""
+        if not isinstance(self.screen, SchedulesScreen):
+            self.push_screen(SchedulesScreen())
 
     def show_alert(self, name: str) -> None:
         """Open what an alert is about; a question is answered in the prompt."""

@@ -268,6 +268,8 @@ class FleetScreen(Screen[None], inherit_bindings=False):
             line.append(words, (Style(reverse=True, bold=True) if here else Style()) + click)
             if here and self.title_of():
                 line.append(f"› {safe(self.title_of(), 40)} ", "bold")
+        if lit not in actions.SCREENS and self.title_of():
+            line.append(f" › {safe(self.title_of(), 40)} ", "bold reverse")
         line.truncate(width, overflow="ellipsis")
         return line
 

@@ -13,6 +13,8 @@ from msgspec import Struct
 from appliance.alerts.rules import ordered
 from appliance.errors import SwiftbotError
 from appliance.learn import recipe as recipes
+from appliance.model import Site
+from appliance.model.schedules import ScheduleList
 from appliance.operations import Argument, Operation
 from appliance.tui.actions import ACTIONS
 from appliance.tui.store import Store
@@ -166,12 +168,23 @@ def fill(action: Operation, given: Mapping[str, str], chosen: Mapping[str, str])
 
 
 def _after(line: str, count: int) -> str:
-    """Return what follows the first `count` words, as typed."""
-    rest = line.strip()
-    for _ in range(count):
-        parts = rest.split(maxsplit=1)
-        rest = parts[1] if len(parts) > 1 else ""
-    return rest.strip()
+    """Return what follows the first `count` words, as typed; quotes keep blanks in one of these words."""
+    end, quote, inside = 0, "", False
+    for at, character in enumerate(line):
+        if quote:
+            quote = "" if character == quote else quote
+        elif character in "\"'" and not inside:
+            quote, inside = character, True
+        elif not character.isspace():
+            inside = True
+        elif inside:
+            inside, count = False, count - 1
+            if not count:
+                end = at
+                break
+    else:
+        return ""
+    return line[end:].strip()
 
 
 # --- completion --------------------------------------------------------------------------------------------
@@ -194,6 +207,8 @@ def candidates(kind: str, store: Store, names: Mapping[str, Iterable[str]]) -> l
             f"{task}/{each.subtask.id}" for task in store.newest for each in store.tasks[task].subtasks
         ),
         "container": lambda: sorted(each.id for each in store.containers.values()),
+        "schedule": lambda: [each.schedule.id for each in asked_schedules(store).schedules],
+        "place": lambda: [f'"{name}"' if " " in name else name for name in asked_places(store)],
         "run": lambda: sorted(store.runs, key=lambda name: -store.runs[name].started_ns),
         "recipe": recipes.built_in,
         "robots": lambda: ("all", *sorted(store.robots)),
@@ -203,6 +218,22 @@ def candidates(kind: str, store: Store, names: Mapping[str, Iterable[str]]) -> l
     if kind in names:
         return list(names[kind])
     return list(known[kind]()) if kind in known else []
+
+
+SCHEDULES, PLACES = "schedules", "places"
+"""Under which the store keeps what was answered last."""
+
+
+def asked_schedules(store: Store) -> ScheduleList:
+    """Return the schedules as they were answered last."""
+    known = store.asked.get(SCHEDULES)
+    return known if isinstance(known, ScheduleList) else ScheduleList()
+
+
+def asked_places(store: Store) -> list[str]:
+    """Return the names of the site's places as they were answered last."""
+    known = store.asked.get(PLACES)
+    return sorted(known.places) if isinstance(known, Site) else []
 
 
 def plain_image(reference: str) -> str:

@@ -88,6 +88,10 @@ class AnyFleet:
         session = SimpleNamespace(publish=lambda *_, **__: None)
         self.plane = SimpleNamespace(registry=registry, members=lambda: frozenset({text}), session=session)
 
+    def known_robots(self) -> Any:
+        """Return the robot."""
+        return self.plane.registry.robots
+
     async def __aenter__(self) -> "AnyFleet":
         return self
 

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from appliance.cli import schedule as commands
 from appliance.cli.common import Where
 from appliance.errors import PlanError
 from appliance.model import Plan, TaskRecord, TaskRequest, TaskState, Word
@@ -23,6 +22,8 @@ from appliance.model.schedules import (
     ScheduleShown,
     ScheduleSpec,
 )
+from appliance.schedules import due
+from appliance.schedules.records import made_name
 from tests.unit.test_cli_faults_seen import run
 
 S = 10**9
@@ -199,22 +200,22 @@ def test_a_saved_instruction_is_run_and_scheduled(fleet: Fleet, capsys: pytest.C
 def test_the_zone_of_this_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """TZ, else what /etc/localtime is a link to; where neither says it, UTC."""
     monkeypatch.setenv("TZ", ":America/New_York")
-    assert commands.local_zone() == "America/New_York"
+    assert due.local_zone() == "America/New_York"
     monkeypatch.delenv("TZ")
     target = tmp_path / "zoneinfo" / "Europe" / "Zurich"
     target.parent.mkdir(parents=True)
     target.touch()
     link = tmp_path / "localtime"
     link.symlink_to(target)
-    monkeypatch.setattr(commands, "LOCALTIME", link)
-    assert commands.local_zone() == "Europe/Zurich"
-    monkeypatch.setattr(commands, "LOCALTIME", tmp_path / "none")
-    assert commands.local_zone() == "UTC"
+    monkeypatch.setattr(due, "LOCALTIME", link)
+    assert due.local_zone() == "Europe/Zurich"
+    monkeypatch.setattr(due, "LOCALTIME", tmp_path / "none")
+    assert due.local_zone() == "UTC"
 
 
 def test_names_are_made_of_words() -> None:
     """In what keys may have, and never empty."""
-    assert commands.made_name("Rover_1: fetch the red box from dock 3 and bring it here") == (
+    assert made_name("Rover_1: fetch the red box from dock 3 and bring it here") == (
         "rover_1-fetch-the-red-box-from-dock-3-an"
     )
-    assert commands.made_name("日本") == "schedule"
+    assert made_name("日本") == "schedule"

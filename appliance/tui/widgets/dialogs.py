@@ -15,6 +15,7 @@ from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Label, Static
 
+from appliance.model.roles import Role
 from appliance.operations import Operation
 from appliance.tui import status_styles
 from appliance.tui.actions import ACTIONS, key_name, keys_of
@@ -110,7 +111,8 @@ def help_text(scope: str, own: Mapping[str, str]) -> RenderableType:
     legend = Text.assemble(
         ("Signs\n", "bold"),
         status_styles.LEGEND,
-        "\n! asks first · w needs the UI unlocked (:write); it starts read-only",
+        "\n! asks first · w needs the UI unlocked (:write); it starts read-only\n"
+        "operator, engineer: the least role that may do it, where there are keys; all else is open to viewers",
     )
     return Group(*parts, legend)
 
@@ -124,6 +126,8 @@ def _table(found: list[Operation], own: Mapping[str, str]) -> Table:
         keys = " ".join(key_name(key) for key in keys_of(action, own))
         marks = f"{'!' if action.dangerous else ''}{'w' if action.writes and not action.always else ''}"
         words = Text.assemble(action.help, "  ", (action.usage, "dim"))
+        if action.role is not Role.VIEWER:
+            words.append(f"  {action.role}", "yellow")
         if action.screens:
             words.append(f"  on {', '.join(action.screens)}", "dim")
         table.add_row(Text(keys, "bold cyan"), Text(marks, "yellow"), words)

@@ -1,4 +1,4 @@
-"""`swiftbot robots drive` in a real terminal: simulated robots of both kinds move while a key is held, and no longer."""
+"""`swiftbot robots drive` in a real terminal: robots of both kinds move while a key is held, and no longer."""
 
 import asyncio
 import math

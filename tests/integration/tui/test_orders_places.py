@@ -4,6 +4,7 @@ What came of it is asked of the fleet itself, by a client that has no part in th
 """
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -13,9 +14,9 @@ from moving_bench import counting
 from appliance.after_stop import robots_of
 from appliance.client import FleetClient
 from appliance.connection import FleetState
-from appliance.errors import RefusedError
+from appliance.errors import PayloadError, RefusedError
 from appliance.model import Approval, ContainerState, Plan, RobotInfo, Subtask, TaskRequest, TaskState
-from appliance.operations import left_of, put_down_here
+from appliance.operations import left_of, maintain, put_down_here, schedule_add
 from appliance.pool.images import reference
 from appliance.pool.settings import PoolConfig
 from appliance.skills.catalogue import load_catalogue
@@ -132,7 +133,7 @@ async def test_what_a_cancelled_task_leaves_is_put_down_or_brought_back(ann: Ope
     assert (found.holding, found.offers[1].do) == ("blue box", "bring_it_back")
 
     await ann.line("bring-back rover_1")
-    await confirm(ann, "Have rover_1 bring what it holds to where it picked it up")
+    await confirm(ann, "Have rover_1 bring what it holds")
     await ann.until(lambda: not rover(client).holding)
     (newest, *_) = (await client.tasks(1)).tasks
     record = await record_of(client, newest.id, final)
@@ -155,6 +156,59 @@ async def test_what_a_cancelled_task_leaves_is_put_down_or_brought_back(ann: Ope
 async def _stops(client: FleetClient, count: int) -> bool:
     """Whether so many soft stops are in force."""
     return len((await client.standing()).active) == count
+
+
+@does("maintain", "end-maintenance", "close-place", "open-place")
+async def test_robots_and_places_out_of_use(ann: Operator, client: FleetClient) -> None:
+    """A robot goes into maintenance until a time and back, a place is closed and opened; the screen lists both."""
+    await ann.press("3", "home")
+    await ann.until(lambda: ann.chosen.get("robot") == "rover_1")
+    await ann.line("maintain rover_1 new wheels")
+    await confirm(ann, "Take rover_1 into maintenance?")
+    await ann.hears("rover_1 is in maintenance by ann: new wheels")
+    await ann.line('close-place "dock 3" flooded')
+    await confirm(ann, "Close dock 3?")
+    await ann.press("S")
+    await ann.see("◌ closed", "dock 3", "flooded", "◌ maint.", "rover_1", "new wheels")
+    found = {each.name: each for each in (await client.closures()).closures}
+    assert [(found[name].until_ns, found[name].by.why) for name in ("dock 3", "rover_1")] == [
+        (0, "flooded"),
+        (0, "new wheels"),
+    ]
+    assert (await maintain(client, "rover_1", why="2h new wheels")).value.until_ns > time.time_ns()
+    await ann.press("tab")
+    await ann.until(lambda: ann.chosen.get("place") == "dock 3")
+    await ann.press("o")
+    await confirm(ann, "Open dock 3?")
+    await ann.hears("dock 3 is open")
+    await ann.until(lambda: ann.chosen.get("robot") == "rover_1")
+    await ann.press("e")
+    await confirm(ann, "End the maintenance of rover_1?")
+    await ann.see("no place is closed")
+    assert not (await client.closures()).closures
+
+
+@does("schedule-add", "schedule-pause", "schedule-resume", "schedule-remove")
+async def test_a_schedule_from_its_screen(ann: Operator, client: FleetClient) -> None:
+    """It is added with its interval, paused, resumed and removed; one that is never due is refused with the reason."""
+    await ann.press("S", "n")
+    await ann.write("1h rover_2: go to dock 2")
+    await ann.press("enter")
+    await confirm(ann, "Add a schedule, 1h: rover_2: go to dock 2?")
+    await ann.see("rover_2-go-to-dock-2", "every 1h", "✔ active")
+    await ann.until(lambda: ann.chosen.get("schedule") == "rover_2-go-to-dock-2")
+    await ann.press("p")
+    await ann.see("‖ paused")
+    (shown,) = (await client.schedules()).schedules
+    assert (shown.schedule.spec.every_s, shown.schedule.added.by) == (3600.0, "ann")
+    await ann.press("r")
+    await ann.see("✔ active")
+    await ann.press("x")
+    await confirm(ann, "Remove schedule rover_2-go-to-dock-2?")
+    await ann.see("no schedules")
+    assert not (await client.schedules()).schedules
+    with pytest.raises(PayloadError, match="too short"):
+        await schedule_add(client, "1s", "rover_2: go to dock 2")
 
 
 # --- gateways and pools ------------------------------------------------------------------------------------------

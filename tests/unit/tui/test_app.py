@@ -431,7 +431,7 @@ async def test_selection_stays_when_tasks_come(view: "FakeView") -> None:
 async def test_help_lists_every_action(view: "FakeView") -> None:
     """The help shows each action of the one list."""
     app = SwiftbotApp(view)
-    async with app.run_test(size=(120, 170)) as pilot:
+    async with app.run_test(size=(120, 210)) as pilot:
         await pilot.press("question_mark")
         await pilot.pause()
         assert isinstance(app.screen, HelpDialog)

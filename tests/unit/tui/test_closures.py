@@ -2,6 +2,7 @@
 
 # pyright: reportPrivateUsage=false, reportArgumentType=false
 
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -9,8 +10,10 @@ from msgspec.structs import replace
 
 from appliance.model import Word
 from appliance.model.closures import Closure, ClosureList
+from appliance.operations import until_and_why
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
+from appliance.tui.command_line import read
 from appliance.tui.robot_view import places
 from appliance.tui.subscriptions import FleetView
 
@@ -68,3 +71,22 @@ def test_a_map_calls_a_closed_place_closed() -> None:
     """At its position."""
     assert places(SITE, {"gate"})["gate closed"] == (5.0, 8.0)
     assert set(places(SITE)) == {"gate", "cold store"}
+
+
+def test_a_reason_may_begin_with_until_when() -> None:
+    """A duration or time first is when it ends by itself; any other first word belongs to the reason."""
+    until_ns, why = until_and_why("2h new wheels")
+    assert (why, abs(until_ns - time.time_ns() - 7200 * 10**9) < 60 * 10**9) == ("new wheels", True)
+    assert until_and_why("14:00")[1] == ""
+    assert until_and_why("14:00")[0] > time.time_ns()
+    for text in ("new wheels", "3rd wheel is loose", "", "99:99 x"):
+        assert until_and_why(text) == (0, text)
+
+
+def test_quotes_keep_a_name_together_before_the_reason() -> None:
+    """`:close-place "dock 3" flooded today` is about dock 3."""
+    command = read('close-place "dock 3" flooded today', {})
+    assert command.given == {"place": "dock 3", "why": "flooded today"}
+    assert read("drain gw-a its fan is loud", {}).given == {"gateway": "gw-a", "why": "its fan is loud"}
+    assert read('close-place "dock 3', {}).given == {"place": "dock 3"}
+    assert read("  drain   gw-a  ", {}).given == {"gateway": "gw-a"}

@@ -66,7 +66,7 @@ async def test_why_goes_along_with_an_order(view: "FakeView", line: str, verb: s
 def test_orders_that_change_something_take_why() -> None:
     """Every order of the registry that a gateway audits can be given a reason; an answer is its own."""
     without = {action.name for action in ACTIONS if action.writes and "why" not in {each.name for each in action.takes}}
-    assert without == {"submit", "duplicate", "answer", "release-robot", "put-down", "bring-back"}
+    assert without == {"submit", "duplicate", "answer", "release-robot", "put-down", "bring-back", "schedule-add"}
 
 
 async def test_a_name_written_wrongly_does_not_stop_nobody(view: "FakeView") -> None:
@@ -91,6 +91,7 @@ ONLY_HERE = {
     "resume-all": "resume",
     "ack-all": "alerts ack",
     "learn-start": "learn start",
+    "end-maintenance": "robots maintain",
 }
 """Commands that do what these operations do with other arguments; plans are edited as files (`task approve --plan`)."""
 
@@ -99,7 +100,12 @@ def test_audited_operations_are_verbs_of_gateways() -> None:
     """The audit log's verbs are in the table of keys, and each is shown as the command that gives it."""
     verbs = {operation.audit for operation in OPERATIONS if operation.audit}
     # Verbs that are audited by what they do.
-    apart = {f"learn_{do}" for do in get_args(Steering)} | {"place_close", "place_open", "robot_maintain"}
+    apart = {f"learn_{do}" for do in get_args(Steering)} | {
+        "place_close",
+        "place_open",
+        "robot_maintain",
+        "robot_maintain_end",
+    }
     apart |= {"schedule_pause", "schedule_resume", "schedule_remove"}
     assert verbs <= {verb.name for verb in VERBS} | apart
     assert {operation.name for operation in OPERATIONS if operation.writes and not operation.audit} == set()

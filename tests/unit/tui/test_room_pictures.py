@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 from msgspec.structs import replace
 
-from appliance.model import Enquiry, Notice, Pose, RobotInfo, SoftStop
+from appliance.model import Enquiry, Notice, Pose, RobotInfo, SoftStop, Word
+from appliance.model.closures import Closure
+from appliance.model.schedules import Schedule, ScheduleList, ScheduleShown, ScheduleSpec
 from appliance.model.task_api import Line, LineKind, PlanChecked
 from appliance.tui.replay import LogFile
 from appliance.tui.screens import replay as replay_screen
@@ -27,6 +29,7 @@ SCREENS = {
     "submit": ("W", "s", *"rover-1 looks", "enter"),
     "robots": ("3",),
     "robot": ("3", "down", "enter"),
+    "schedules": ("S",),
     "log": ("7",),
     "replay": ("8",),
 }
@@ -55,6 +58,14 @@ def rooms(view: "FakeView", monkeypatch: pytest.MonkeyPatch) -> Iterator["FakeVi
     ]
     logs = [LogFile(path=Path("/logs/fleet-0001.mcap"), size=3 * 2**20, written_s=NOW_NS / 1e9)]
     monkeypatch.setattr(replay_screen, "find_logs", lambda _own, _fleet: logs)
+    schedule = Schedule(
+        spec=ScheduleSpec(id="round", instruction="rover-2: patrol the hall", every_s=600.0),
+        added=Word(by="olga", why="night watch"), fired=7, fired_ns=NOW_NS, task="t-done", missed=1,
+        missed_why="the task before had not ended",
+    )  # fmt: skip
+    shown = ScheduleShown(schedule=schedule, owner="gw-a")
+    view.orders.answers["schedules"] = ScheduleList(schedules=(shown,))
+    view.store.take_closure(Closure(kind="place", name="gate", by=Word(by="olga", why="ice")))
     with universal_time(monkeypatch):
         yield view
 
@@ -66,7 +77,7 @@ async def test_screen_looks_as_it_did(rooms: "FakeView", screen: str, size: tupl
     await compare_screen(rooms, screen, SCREENS[screen], size)
 
 
-@pytest.mark.parametrize("screen", ["tasks", "task", "review", "robots", "robot", "log", "replay"])
+@pytest.mark.parametrize("screen", ["tasks", "task", "review", "robots", "robot", "schedules", "log", "replay"])
 @OTHER_SIZES
 async def test_other_sizes_are_never_refused(rooms: "FakeView", screen: str, size: tuple[int, int]) -> None:
     """Narrower and wider than usual, a screen still shows what comes first in it."""

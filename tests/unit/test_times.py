@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.cli.times import duration_s, moment_ns, since_ns
 from appliance.errors import ConfigError
+from appliance.times import duration_s, moment_ns, since_ns
 
 ZURICH = ZoneInfo("Europe/Zurich")
 NOW = datetime(2026, 11, 27, 18, 0, tzinfo=ZURICH)
