@@ -117,6 +117,14 @@ def foxglove(
     host: str = "127.0.0.1",
     port: int = 8765,
     keys: Annotated[tuple[str, ...], Parameter(name="--key", help="Only keys that match.")] = (),
+    origins: Annotated[
+        tuple[str, ...],
+        Parameter(
+            name="--origin",
+            help="Serve pages of this origin too, such as https://app.foxglove.dev; repeatable. By default programs"
+            " and pages of this machine are served.",
+        ),
+    ] = (),
     where: Where = HERE,
 ) -> int:
     """Show the running fleet in Foxglove: open ws://127.0.0.1:8765 there. Until SIGTERM or Ctrl-C.
@@ -146,7 +154,7 @@ def foxglove(
         logs.configure(style="text")
 
     async def go() -> None:
-        options = LiveOptions(host=host, port=port, keys=keys)
+        options = LiveOptions(host=host, port=port, keys=keys, origins=origins)
         await serve(options, plane, fleet, until_signalled(), about=about_log, told=_notify_systemd)
 
     uvloop.run(go())

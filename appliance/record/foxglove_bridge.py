@@ -3,13 +3,14 @@
 Foxglove connects to a WebSocket server (its protocol is `foxglove.sdk.v1`; the server is the `foxglove-sdk` package, an
 optional extra). Channels, schemas and derived messages are those of a log, by the same code, and secrets are taken out
 as they are there. A slow client loses its oldest messages (the SDK's bounded backlog); the fleet never waits for it.
+Pages of other sites are not served (`origin_gate`).
 """
 
 import asyncio
 import contextlib
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import AsyncGenerator, Callable
 from typing import Any
 
 import structlog
@@ -21,6 +22,7 @@ from appliance.plane.session import Closer, Session
 from appliance.plane.settings import PlaneConfig
 from appliance.record.channels import shared_for
 from appliance.record.models import LoggedMessage, check_expression, compile_expression
+from appliance.record.origin_gate import LOOPBACK, Gate, check_origin, make_certificate
 from appliance.record.redact import Redactor
 from appliance.record.schemas import ChannelKind, Derive, Foxglove, KeySchemas
 from appliance.record.segments import JSON, LAST_NS, About
@@ -36,7 +38,6 @@ MOST_CHANNELS = 10_000
 count as well."""
 BACKLOG = 1024
 """Messages that wait for one client; the oldest are dropped."""
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 class LiveOptions(Struct, frozen=True, kw_only=True):
@@ -46,6 +47,8 @@ class LiveOptions(Struct, frozen=True, kw_only=True):
     """Loopback: Foxglove's protocol knows no password. From elsewhere: an SSH tunnel."""
     port: int = PORT
     """0: any that is free."""
+    origins: tuple[str, ...] = ()
+    """Of web pages that are served besides those of this machine, such as https://app.foxglove.dev."""
     keys: tuple[str, ...] = ()
     """Key expressions; only keys that one of them includes. None: all."""
 
@@ -58,6 +61,8 @@ class LiveOptions(Struct, frozen=True, kw_only=True):
             )
         for each in self.keys:
             check_expression(each)
+        for each in self.origins:
+            check_origin(each)
         if not 0 <= self.port <= 65535:
             raise ConfigError(f"--port {self.port}", remedy="give 0 (any) to 65535")
 
@@ -71,7 +76,7 @@ class _Channel:
 
 
 class LiveView:
-    """Serves one fleet's messages.
+    """Serves one fleet's messages to programs of this machine, over TLS; `viewing` puts a gate before it for pages.
 
     Args:
         session: on the fleet's plane.
@@ -80,7 +85,7 @@ class LiveView:
 
     Raises:
         PrerequisiteError: foxglove-sdk is not installed.
-        ConfigError: the port cannot be listened on.
+        ConfigError: it cannot listen.
     """
 
     def __init__(self, session: Session, options: LiveOptions, *, about: About | None = None) -> None:
@@ -101,23 +106,24 @@ class LiveView:
         """By key and encoding, the one that was silent for longest first; None: not wanted."""
         self._subscription: Closer | None = None
         self.messages = 0
+        self.certificate = make_certificate()
         try:
             self._server: Any = self._foxglove.start_server(
                 name=f"SwiftBot {session.keys.fleet}",
-                host=options.host,
-                port=options.port,
+                host="127.0.0.1",
+                port=0,
+                tls_cert=self.certificate.pem,
+                tls_key=self.certificate.key,
                 context=self._context,
                 message_backlog_size=BACKLOG,
                 supported_encodings=["json"],
             )
         except (RuntimeError, OSError, ValueError) as error:
-            raise ConfigError(
-                f"the live view cannot listen on {options.host}:{options.port}: {error}", remedy="choose another --port"
-            ) from error
+            raise ConfigError(f"the live view cannot listen: {error}", remedy="see that the loopback is up") from error
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
+        """The port it listens on, behind the gate."""
         return int(self._server.port)
 
     @property
@@ -210,6 +216,26 @@ def _sdk() -> Any:
     return foxglove
 
 
+@contextlib.asynccontextmanager
+async def viewing(
+    session: Session, options: LiveOptions, *, about: About | None = None
+) -> AsyncGenerator[tuple[LiveView, Gate, int]]:
+    """Serve a fleet's messages behind a gate; gives the view, the gate and the port that clients connect to.
+
+    Raises:
+        PrerequisiteError, ConfigError: as `LiveView`; the port cannot be listened on.
+    """
+    view = LiveView(session, options, about=about)
+    gate = Gate(view.port, view.certificate, options.origins)
+    try:
+        port = await gate.start(options.host, options.port)
+        await asyncio.to_thread(view.start)
+        yield view, gate, port
+    finally:
+        await gate.close()
+        await asyncio.to_thread(view.stop)
+
+
 async def serve(
     options: LiveOptions,
     plane: PlaneConfig,
@@ -235,17 +261,13 @@ async def serve(
     """
     session = await Session.open(plane, fleet)
     try:
-        view = LiveView(session, options, about=about)
-        await asyncio.to_thread(view.start)
-        log.info("live view", address=f"ws://{options.host}:{view.port}", fleet=fleet)
-        try:
+        async with viewing(session, options, about=about) as (view, _, port):
+            log.info("live view", address=f"ws://{options.host}:{port}", fleet=fleet)
             while not stop.is_set():
                 told(view)
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(1.0):
                         await stop.wait()
-        finally:
-            await asyncio.to_thread(view.stop)
         return view.messages
     finally:
         await session.close()
