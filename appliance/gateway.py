@@ -349,6 +349,7 @@ class Gateway:
             store=self.plane.store,
             on_decided=self._tell_decided,
             parts=self._parts,
+            max_result_bytes=config.tasks.max_result_bytes,
         )
         reservations = Reservations(config.id, self.pool)
         self.executor = Executor(

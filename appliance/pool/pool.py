@@ -63,7 +63,7 @@ from appliance.pool.pressure import Reading
 from appliance.pool.runs import Call, Runs
 from appliance.pool.selection import Candidate, Decision, Facts, select
 from appliance.pool.settings import PoolConfig
-from appliance.pool.starter import Starter
+from appliance.pool.starter import MAX_RESULT_BYTES, Starter
 from appliance.pool.volumes import ALONE, State
 from appliance.skills.catalogue import Catalogue, SkillManifest, broken_promises
 
@@ -263,6 +263,7 @@ class Pool:
         make_engine: Callable[[], Engine] | None = None,
         read_memory: Callable[[], Reading] | None = None,
         parts: InForce = ALL,
+        max_result_bytes: int = MAX_RESULT_BYTES,
     ) -> None:
         known = ", ".join(sorted(catalogue.images))
         for image in config.floor:
@@ -289,6 +290,7 @@ class Pool:
                 on_death=on_death,
                 state=state,
                 parts=parts,
+                max_result_bytes=max_result_bytes,
             )
 
         self._keeper = ContainerManager(

@@ -57,6 +57,8 @@ FOLDERS = "/folders"
 CACHE = "/cache"
 """Where containers find the folders of the gateway's machine, and what they cache."""
 ADOPT_TIMEOUT_S = 2.0
+MAX_RESULT_BYTES = 48 * 1024
+"""Of a run, as JSON, where nothing else is said; `tasks.max_result_bytes`."""
 LABEL_SIZE = "swiftbot.size"
 
 
@@ -89,7 +91,9 @@ class Starter:
         on_death: Callable[[PooledContainer], None],
         state: State,
         parts: InForce = ALL,
+        max_result_bytes: int = MAX_RESULT_BYTES,
     ) -> None:
+        self._max_result_bytes = max_result_bytes
         self._state = state
         self._parts = parts
         self._config = config
@@ -429,6 +433,7 @@ class Starter:
             "site": self._site,
             "volumes": "/volumes",
             "reserve_mb": self._config.transfer.reserve_mb,
+            "max_result_bytes": self._max_result_bytes,
             "import_s": max(IMPORT_S, self._catalogue.images[image].load_s),
             "patience_s": PRELOAD_PART * self.start_timeout_s(image),
             "folders": FOLDERS,

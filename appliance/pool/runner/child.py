@@ -28,8 +28,6 @@ from .limits import address_space, limit_ahead, limit_run
 from .link import LARGE, CallError, Cancelled, Fail, Frame, Link
 from .preload import Loaded, explain
 
-MAX_RESULT = 4 * 2**20
-"""Longest result in bytes of JSON; larger things are artifacts."""
 MAX_OUTPUT = 256 * 1024
 """Bytes of a handler's own stdout and stderr that are kept as log lines."""
 MAX_LINES = 1900
@@ -123,7 +121,7 @@ def _outcome(order: Frame, link: Link, kit: Kit) -> Frame:  # noqa: PLR0911 - on
             result = {}
         if not isinstance(result, dict):
             return _error("skill", f"{name} returned {type(result).__name__}, not a dict", remedy="return a dict")
-        if problem := _unfit(name, cast("Frame", result)):
+        if problem := _unfit(name, cast("Frame", result), spec.max_result_bytes):
             return problem
     except Cancelled:
         return _cancelled(kit, name)
@@ -147,8 +145,8 @@ def _outcome(order: Frame, link: Link, kit: Kit) -> Frame:  # noqa: PLR0911 - on
     return {"ev": "result", "result": result}
 
 
-def _unfit(name: str, result: Frame) -> Frame | None:
-    """Return the error of a result that cannot be sent; None for one that can."""
+def _unfit(name: str, result: Frame, most: int) -> Frame | None:
+    """Return the error of a result that cannot be kept, of `most` bytes; None for one that can."""
     try:
         size = size_of(result)
     except (TypeError, ValueError, RecursionError) as error:
@@ -156,8 +154,8 @@ def _unfit(name: str, result: Frame) -> Frame | None:
         return _error(
             "skill", text, remedy="return dicts with text keys, lists, texts, finite numbers, bool, None, bytes"
         )
-    if size > MAX_RESULT:
-        return _error("payload", beyond(f"the result of {name}", size, MAX_RESULT), remedy=LARGE)
+    if size > most:
+        return _error("payload", beyond(f"the result of {name}", size, most), remedy=LARGE)
     return None
 
 

@@ -89,6 +89,7 @@ class Context(Surroundings):
         scratch: A folder of this run alone, gone afterwards.
         cache: A folder that all containers of the image on this gateway share, for what can be worked out again; it may
             be emptied at any time. `scratch` where the manifest asks for none.
+        max_result_bytes: Longest result, bytes of JSON; what is larger belongs into a volume or an artifact.
     """
 
     CallError = CallError
@@ -107,6 +108,7 @@ class Context(Surroundings):
         self.preloaded = preloaded
         self.scratch = scratch
         self.cache = spec.cache or scratch
+        self.max_result_bytes = spec.max_result_bytes
 
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:
         """Have the robot do `verb` and return its answer; files come as bytes in `answer["blobs"][name]`.

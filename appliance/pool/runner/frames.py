@@ -79,8 +79,9 @@ def size_of(value: dict[str, Any]) -> int:
 
 
 def beyond(what: str, size: int, most: int) -> str:
-    """Return the sentence for something that is too long, in bytes and MiB."""
-    return f"{what} has {size:,} bytes of JSON, at most {most:,} ({most / 2**20:g} MiB) are possible"
+    """Return the sentence for something that is too long, in bytes and MiB or KiB."""
+    shown = f"{most / 2**20:g} MiB" if most >= 2**20 else f"{most / 2**10:g} KiB"
+    return f"{what} has {size:,} bytes of JSON, at most {most:,} ({shown}) are possible"
 
 
 class Decoder:

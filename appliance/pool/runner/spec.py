@@ -43,6 +43,8 @@ class Spec:
         """Where runs keep what they can work out again; None: nowhere."""
         self.reserve_mb = int(table.get("reserve_mb", 0))
         """What is to be left free on the disk of the volumes, MB; 0: it is not watched."""
+        self.max_result_bytes = int(table.get("max_result_bytes", 4 * 2**20))
+        """Longest result in bytes of JSON; larger things are artifacts."""
         self.import_s = float(table.get("import_s", 10.0))
         """Longest import of one module or handler."""
         self.patience_s = float(table.get("patience_s", 15.0))

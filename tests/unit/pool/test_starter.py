@@ -9,7 +9,7 @@ import pytest
 
 from appliance.model import Need, Phase, RunRequest
 from appliance.pool.settings import PoolConfig
-from appliance.pool.starter import IMPORT_S, PRELOAD_PART, Starter
+from appliance.pool.starter import IMPORT_S, MAX_RESULT_BYTES, PRELOAD_PART, Starter
 from appliance.pool.volumes import ALONE
 from appliance.skills.catalogue import Catalogue, load_catalogue
 from tests.unit.pool.bench import Bench
@@ -25,7 +25,7 @@ def run(ctx):
         read = (ctx.host_folder("yard") / "map").read_text()
     except ctx.Fail as error:
         read = error.message
-    return {"read": read, "before": before}
+    return {"read": read, "before": before} | ctx.params | {"most": ctx.max_result_bytes}
 """
 MANIFEST = """
 id = "reader"
@@ -106,8 +106,29 @@ async def test_a_folder_of_the_machine_is_read(bench: Bench, tmp_path: Path) -> 
     (tmp_path / "yard").mkdir()
     (tmp_path / "yard" / "map").write_text("dock 3")
     settings = {"folders": {"yard": str(tmp_path / "yard")}}
-    assert await _run(bench, 1, **settings) == {"read": "dock 3", "before": ""}
+    assert await _run(bench, 1, **settings) == {"read": "dock 3", "before": "", "most": MAX_RESULT_BYTES}
     assert (bench.folder / "data" / "f1" / "g1" / "cache" / "heavy" / "kept").read_text() == "worked out"
+
+
+async def test_a_result_beyond_the_limit_is_refused_where_the_handler_returns_it(bench: Bench) -> None:
+    """By the one limit that holds for a task's record, with what to do instead; one that just fits is kept."""
+    own = bench.folder / "data" / "f1" / "g1" / "folders" / "yard"
+    own.mkdir(parents=True)
+    (own / "map").write_text("dock 4")
+    pool = await bench.pool()
+    need = Need(image="heavy", cpu=0.2, memory_mb=64)
+    for number, length in enumerate((MAX_RESULT_BYTES - 400, MAX_RESULT_BYTES)):
+        request = RunRequest(
+            task="t", subtask=f"s{number}", attempt=1, skill="reader", need=need, params={"text": "x" * length}
+        )
+        last = await pool.run(request, await pool.select(need, allow_remote=False), lambda _: None)
+        if length < MAX_RESULT_BYTES:
+            assert last.result is not None, last
+            continue
+        assert last.failure is not None
+        assert last.failure.code == "payload"
+        assert "at most 49,152 (48 KiB)" in last.failure.message
+        assert "ctx.put_artifact" in last.failure.remedy
 
 
 async def test_a_folder_that_is_not_configured_is_the_gateways_own(bench: Bench) -> None:
