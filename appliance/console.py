@@ -462,6 +462,7 @@ def fleet_view(gateways: Sequence[GatewayStatus], lost: Mapping[str, int] | None
     """
     notes = together(note for each in gateways for note in each.recorders)
     lines = [Text(f"! {text}", style="yellow") for note in notes if (text := recorder_text(note))]
+    lines += [Text(f"! recorder {note.id}: {note.going}", style="yellow") for note in notes if note.going]
     if any(each.parts == DEVELOPMENT for each in gateways):
         lines.append(Text(DEVELOPMENT, style="dim"))
     return Group(gateway_table(gateways, lost), *lines)

@@ -186,6 +186,11 @@ def _recorders(facts: Facts) -> Iterator[Finding]:
                 name=_name(note),
                 remedy="systemctl status swiftbot-recorder; make room" if broken else "`swiftbot log info FILE`",
             )
+        if note.going:
+            yield Finding(
+                kind="logs-go", level=WARNING, what=note.going[:MAX_WHAT], subject=Subject.RECORDER, name=_name(note),
+                remedy="copy them, `swiftbot log pin FILE`, or raise record.total_bytes or record.days",
+            )  # fmt: skip
 
 
 def _questions(facts: Facts) -> Iterator[Finding]:

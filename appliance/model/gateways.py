@@ -154,6 +154,8 @@ class RecorderNote(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """As in RecorderStatus, or `silent`: not heard for more than 5 s."""
     problem: str = ""
     """Why it does not record; empty when it does."""
+    going: str = ""
+    """Which of its logs are removed soon if nobody keeps them, in words; empty when none are."""
     missed: int = 0
     """Messages of the fleet that are not in its log, since it was started."""
     keys: dict[str, int] = field(default_factory=dict[str, int])

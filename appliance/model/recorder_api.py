@@ -83,7 +83,9 @@ class RecorderStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     held: int = 0
     """Messages that wait in the ring for an incident."""
     removed: int = 0
-    """Old files removed to stay within the disk budget."""
+    """Old files removed to stay within the budget of disk and days."""
+    going: str = ""
+    """Which logs are removed soon if nobody keeps them, in words; empty when none are."""
     started_ns: int = 0
     at_ns: int = 0
 

@@ -154,6 +154,7 @@ def note_of(status: RecorderStatus, *, silent: bool = False) -> RecorderNote:
         id=status.id,
         state=SILENT if silent else status.state,
         problem=status.problem[:300],
+        going=status.going[:300],
         missed=sum(status.missed.values()),
         keys=keys,
         missed_at_ns=status.missed_at_ns,

@@ -524,6 +524,7 @@ class Recorder:
             unwritten_incidents=writer.waiting_marks,
             held=self._pipeline.gate.held,
             removed=writer.removed,
+            going=writer.going,
         )
 
     @property

@@ -32,7 +32,7 @@ from appliance.record.channels import Shared, shared_for
 from appliance.record.mcap_writer import LogFile, McapFile, free_bytes
 from appliance.record.models import LoggedMessage
 from appliance.record.redact import LEAST_SECRET, Redactor, known_secrets, without_secrets
-from appliance.record.retention import make_room
+from appliance.record.retention import finished, going_text, make_room
 from appliance.record.schemas import ChannelKind, Derive, Foxglove, KeySchemas
 from appliance.record.settings import RecordConfig
 
@@ -300,7 +300,9 @@ class LogWriter:
         self.missed_at_ns = 0
         """Time of the last of them; 0: none is missing."""
         self.removed = 0
-        """Old files removed to stay within `total_bytes`."""
+        """Old files removed to stay within `total_bytes` and `days`."""
+        self.going = ""
+        """Which files go next if nobody keeps them, in words."""
         self._prefix = file_prefix(fleet, config.name)
         keys = Keys(fleet)
         self._schemas = KeySchemas(keys)
@@ -514,11 +516,11 @@ class LogWriter:
         return self._current
 
     def _start(self, now: float) -> OpenLog:
-        if self.config.total_bytes:
-            # Room for the file that begins now, too.
-            room = self.config.total_bytes - self.config.rotate_bytes
-            self.removed += make_room(self.config.folder, self._prefix, budget_bytes=room)
         started_ns = self._wall()
+        folder, budget = self.config.folder, self.config.budget
+        self.removed += make_room(folder, self._prefix, budget, now_ns=started_ns)
+        files, warn_s = finished(folder, self._prefix), self.config.warn_hours * 3600
+        self.going = going_text(files, budget, now_ns=started_ns, warn_s=warn_s)
         stamp = datetime.fromtimestamp(started_ns / 1e9, tz=UTC)
         while True:
             self._sequence += 1

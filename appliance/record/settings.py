@@ -10,6 +10,7 @@ from msgspec import Struct
 
 from appliance.errors import ConfigError, PayloadError
 from appliance.model.keys import check_name
+from appliance.record.retention import Budget
 
 
 class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -54,6 +55,10 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     total_bytes: int = 8 * 2**30
     """What this recorder's files may take together; at each new file the oldest go, pinned ones never. 0: no limit.
     A local fleet of three gateways and two robots at work writes 17 to 29 MB an hour: this is some twelve days."""
+    days: float = 90.0
+    """How long a file is kept after it was written to, pinned ones for good. 0: as long as there is room."""
+    warn_hours: float = 24.0
+    """So long before the oldest log goes there is an alert: copy or pin what is to be kept. 0: none."""
     queue_messages: int = 60_000
     """Messages waiting for the writer thread; more are dropped, counted and written down as a gap. A disk that takes a
     second to sync is no loss then, at all that a fleet can say."""
@@ -97,8 +102,19 @@ class RecordConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
                 f"record.total_bytes is {self.total_bytes}, less than two files of record.rotate_bytes",
                 remedy="raise it, lower rotate_bytes, or give 0 for no limit",
             )
+        for key in ("days", "warn_hours"):
+            if not 0 <= getattr(self, key) <= 36_500:
+                raise ConfigError(f"record.{key} is {getattr(self, key)}", remedy="give 0 (none) to 36500")
         if self.free_bytes < 0:
             raise ConfigError(f"record.free_bytes is {self.free_bytes}", remedy="give 0 or more")
+
+    @property
+    def budget(self) -> Budget:
+        """What files may take when a new one begins, which needs room too."""
+        return Budget(
+            most_bytes=self.total_bytes - self.rotate_bytes if self.total_bytes else None,
+            most_s=self.days * 86_400 if self.days else None,
+        )
 
     @property
     def folder(self) -> Path:

@@ -81,6 +81,7 @@ down = PlannerStatus(slot=SlotStatus(model="m", state="down", problem="its proce
         (of(robot(warnings=("battery low",))), {"robot-warning.rover_1": WARNING}),
         (of(replace(gateway(), recorders=(RecorderNote(id="rec", state="silent"),))), {"recorder.rec": CRITICAL}),
         (of(replace(gateway(), recorders=(RecorderNote(id="rec", problem="disk full"),))), {"recorder.rec": CRITICAL}),
+        (of(replace(gateway(), recorders=(RecorderNote(id="rec", going="logs go"),))), {"logs-go.rec": WARNING}),
         (of(replace(gateway(), recorders=(RecorderNote(id="rec", missed=3, keys={"gw/*/log": 3}),))),
          {"recorder.rec": WARNING}),
         (of(*map(gateway, NAMES), clock_s={"gw-1": 0.0, "gw-2": 0.4, "gw-3": -60.0}), {"clock.gw-3": WARNING}),

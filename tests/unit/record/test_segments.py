@@ -177,6 +177,21 @@ def test_rotation_by_size(tmp_path: Path) -> None:
     assert not any(info(path).recovered for path in writer.files)
 
 
+def test_it_says_which_files_go_next(tmp_path: Path) -> None:
+    """As soon as there are enough to tell by that the budget is nearly spent, before any has gone."""
+    clock = Clock()
+    writer = _writer(tmp_path, clock, rotate_bytes=2_000, total_bytes=60_000, chunk_bytes=300, compression="none")
+    for number in range(400):
+        writer.write(_message(number))
+        clock.now += 1
+        writer.tick()
+        if writer.going:
+            break
+    writer.close()
+    assert "are removed within 24 h" in writer.going
+    assert not writer.removed
+
+
 def test_old_files_go_when_the_budget_is_spent(tmp_path: Path) -> None:
     """All files together stay within `total_bytes`; what is left are the newest, unbroken, and it is counted."""
     clock = Clock()
