@@ -478,7 +478,18 @@ def recorder_text(note: RecorderNote) -> str:
 def gateway_table(gateways: Sequence[GatewayStatus], lost: Mapping[str, int] | None = None) -> Table:
     """Gateways, a line each; `lost`: those that do not answer, and since when."""
     table = Table(box=None, pad_edge=False, header_style="bold dim")
-    for name in ("gateway", "load", "memory", "containers", "runs", "tasks", "robots", "plans with", "state"):
+    for name in (
+        "gateway",
+        "version",
+        "load",
+        "memory",
+        "containers",
+        "runs",
+        "tasks",
+        "robots",
+        "plans with",
+        "state",
+    ):
         table.add_column(name, overflow="fold")
     for each in gateways:
         state = "draining" if each.draining else each.pool_problem or "up"
@@ -492,6 +503,7 @@ def gateway_table(gateways: Sequence[GatewayStatus], lost: Mapping[str, int] | N
             state += f", {each.parts_problem}"
         table.add_row(
             each.id,
+            each.version or "–",
             f"{each.load:.0%}",
             f"{each.memory_mb:.0f} MB",
             f"{each.ready} ready of {each.containers} (at most {each.capacity})",
@@ -503,7 +515,7 @@ def gateway_table(gateways: Sequence[GatewayStatus], lost: Mapping[str, int] | N
         )
     for name, since_ns in sorted((lost or {}).items()):
         state = Text(f"LOST since {time_of_day(since_ns)}", style="bold red")
-        table.add_row(name, *("–" for _ in range(7)), state)
+        table.add_row(name, *("–" for _ in range(8)), state)
     return table
 
 

@@ -48,6 +48,7 @@ from appliance.model import (
     RobotInfo,
     Site,
     VolumeInfo,
+    gateways,
     keyspace,
 )
 from appliance.model.alerts import AlertsAsk
@@ -691,6 +692,8 @@ class Gateway:
             id=self.config.id,
             fleet=self.config.fleet,
             version=VERSION,
+            protocol=gateways.PROTOCOL,
+            oldest_protocol=gateways.OLDEST_PROTOCOL,
             load=min(1.0, max(vitals.cpu_percent / 100, self.executor.running / max(1, capacity))),
             cpu_percent=vitals.cpu_percent,
             memory_mb=vitals.memory_mb,

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from appliance.model import Enquiry, GatewayStatus, RecorderNote, RobotInfo, TaskRecord, TaskState
 from appliance.model.alerts import Alert, AlertLevel, Subject
+from appliance.model.gateways import works_beside
 from appliance.record.models import SILENT, problem_of, together
 
 CRITICAL, WARNING = AlertLevel.CRITICAL, AlertLevel.WARNING
@@ -120,6 +121,9 @@ def _gateways(facts: Facts) -> Iterator[Finding]:
             yield of("no-limits", WARNING, "container limits are not enforced (no cgroups)", "`swiftbot doctor` there")
         if status.site_problem:
             yield of("site", WARNING, status.site_problem, "add [fence] to the site's file")
+        if not works_beside(status):
+            what = f"version {status.version} speaks protocol {status.protocol}, which the others do not"
+            yield of("version", CRITICAL, what, "`swiftbot upgrade` brings all gateways to one version")
         if status.keys_problem:
             yield of("keys", WARNING, status.keys_problem, "`swiftbot keys list`, then `swiftbot keys renew ROLE NAME`")
         if status.parts_problem:

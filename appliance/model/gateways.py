@@ -164,12 +164,24 @@ class RecorderNote(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Time of the last one that is missing."""
 
 
+PROTOCOL = 1
+"""What gateways of this version say to each other: keys, messages and records. One higher with each change that an
+older one cannot ignore: a new field with a default is none."""
+OLDEST_PROTOCOL = 1
+"""The oldest that a gateway of this version works beside: that of the version before, so that a fleet is upgraded one
+gateway after another."""
+
+
 class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A gateway's own account of itself, pushed on change and every few seconds."""
 
     id: str
     fleet: str
     version: str = ""
+    protocol: int = 1
+    """What it says to other gateways; versions before there were numbers say nothing, which is 1."""
+    oldest_protocol: int = 1
+    """The oldest that it works beside."""
     load: float = 0.0
     """0 idle to 1 saturated: the larger of CPU and pool use."""
     cpu_percent: float = 0.0
@@ -251,3 +263,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """It will be put again within so long, changed or not."""
     asked: dict[str, float] = field(default_factory=dict[str, float])
     """Image -> placements a second that this gateway decides, to the next power of two."""
+
+
+def works_beside(status: GatewayStatus) -> bool:
+    """Whether a gateway of this version can be in one fleet with another (pure)."""
+    return status.oldest_protocol <= PROTOCOL and status.protocol >= OLDEST_PROTOCOL

@@ -27,7 +27,7 @@ class LearnStartAsk(Signed, frozen=True, kw_only=True):
     recipe: Recipe
 
 
-class LearnDataAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LearnDataAsk(Struct, frozen=True, kw_only=True):
     """`learn_data`: what the asked gateway has of some data sets, by their paths in its folder `learning`."""
 
     paths: tuple[str, ...]

@@ -89,7 +89,7 @@ class Row(Struct, frozen=True, kw_only=True):
     age_s: float = 0.0
 
 
-class ProposeAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ProposeAsk(Struct, frozen=True, kw_only=True):
     """`propose`: what does the local model of the asked gateway make of an instruction?"""
 
     instruction: str

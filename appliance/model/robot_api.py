@@ -278,7 +278,7 @@ class StopAnswer(Struct, frozen=True, kw_only=True):
     """Robots that did not, and why."""
 
 
-class StandingAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class StandingAsk(Struct, frozen=True, kw_only=True):
     """`standing`: with what the asker knows, so that both know the same afterwards."""
 
     stops: tuple[SoftStop, ...] = ()

@@ -238,7 +238,7 @@ class ExperienceList(Struct, frozen=True, kw_only=True):
     """Tier -> confidence from which its plans run unasked."""
 
 
-class RunAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RunAsk(Struct, frozen=True, kw_only=True):
     """`run_status` and `run_cancel`: which attempt of which subtask."""
 
     task: str
@@ -310,7 +310,7 @@ class ArtifactPiece(Struct, frozen=True, kw_only=True):
     size: int
 
 
-class ArtifactKeep(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ArtifactKeep(Struct, frozen=True, kw_only=True):
     """`artifact_keep`: fetch a file from a gateway that has it and keep it for an owner, the key of a record."""
 
     artifact: str
@@ -405,7 +405,7 @@ class MoveCancelled(Struct, frozen=True, kw_only=True):
     cancelled: bool
 
 
-class HoldAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class HoldAsk(Struct, frozen=True, kw_only=True):
     """`run_hold`: an attempt that is about to be moved."""
 
     task: str

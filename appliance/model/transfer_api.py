@@ -43,7 +43,7 @@ class Manifest(Struct, frozen=True, kw_only=True, omit_defaults=True):
         return offset, min(self.chunk_bytes, self.size_bytes - offset)
 
 
-class ManifestAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ManifestAsk(Struct, frozen=True, kw_only=True):
     """`kind` is `volume`, `image` or `blob`."""
 
     kind: str

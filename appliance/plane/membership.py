@@ -50,7 +50,7 @@ import msgspec
 import structlog
 
 from appliance.errors import ConfigError, IdentityError, PayloadError, SwiftbotError
-from appliance.model import GatewayStatus, encode, keyspace
+from appliance.model import GatewayStatus, encode, gateways, keyspace
 from appliance.model.keys import check_name
 from appliance.model.plane_api import Facts, FactsAsk
 from appliance.plane.events import FleetEvent, FleetEvents, Joined, Lost, Stage, Stall, Stalled
@@ -559,6 +559,44 @@ class Suspicion:
             del self._others[next(iter(self._others))]
         self._others[other] = since, count + 1
         return count + 1 >= NAMESAKE_STATUSES and now - since >= NAMESAKE_S
+
+
+class Versions:
+    """Finds out whether gateways are here that this one does not work beside, and whether this one has to go.
+
+    The later one goes: a fleet that works is not disturbed by one that comes.
+
+    Args:
+        session: of this gateway.
+        own: what it has told of itself last.
+    """
+
+    def __init__(self, session: Session, *, own: Callable[[], GatewayStatus | None]) -> None:
+        self.displaced = asyncio.Event()
+        """Another gateway was here first, and this one does not work beside it."""
+        self.problem: ConfigError | None = None
+        self._session = session
+        self._own = own
+        self._told: set[Process] = set()
+
+    def heard(self, status: GatewayStatus) -> None:
+        """Take in what another gateway says of itself."""
+        if gateways.works_beside(status) or process(status) in self._told:
+            return
+        if len(self._told) < _MOST_PROCESSES:
+            self._told.add(process(status))
+        newer = status.oldest_protocol > gateways.PROTOCOL
+        text = (
+            f"gateway {status.id} (version {status.version or 'unknown'}) speaks protocol {status.protocol} and works "
+            f"beside {status.oldest_protocol} and later; this one speaks {gateways.PROTOCOL} and works beside "
+            f"{gateways.OLDEST_PROTOCOL} and later"
+        )
+        self._session.refuse("incompatible gateway", reason=text)
+        own = self._own()
+        if own is None or process(own) > process(status):
+            remedy = "upgrade this gateway" if newer else f"upgrade {status.id} first, version by version"
+            self.problem = ConfigError(text, remedy=f"{remedy} (`swiftbot upgrade`)")
+            self.displaced.set()
 
 
 class Namesakes:

@@ -213,19 +213,27 @@ class Plane:
         return self._back.is_set()
 
     async def displaced(self) -> ConfigError:
-        """Wait until another gateway of this one's id is there and this one has to go; returns what is wrong.
+        """Wait until another gateway is there because of which this one has to go; returns what is wrong.
+
+        It has this one's id, or this one does not work beside its version.
 
         Two of one name can meet although each found it free: they began at one moment, or on two sides of a cut. By
         then a copy of each record that is here is with the others, who can ask only one of the two for what it has.
         """
-        if self.registry.namesakes is not None:
-            await self.registry.namesakes.displaced.wait()
+        finders = [each for each in (self.registry.namesakes, self.registry.versions) if each is not None]
+        waits = [asyncio.create_task(each.displaced.wait()) for each in finders]
+        try:
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for each in waits:
+                each.cancel()
         try:
             async with asyncio.timeout(GIVE_S):
                 await self._reconciler.give_all()
         except (TimeoutError, SwiftbotError) as error:
             log.warning("not all records could be given to the others", reason=str(error))
-        return displaced(self.gateway)
+        versions = self.registry.versions
+        return (versions.problem if versions is not None else None) or displaced(self.gateway)
 
     async def _join(self) -> None:
         membership = self._membership

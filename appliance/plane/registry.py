@@ -40,7 +40,7 @@ from appliance.model.keys import check_name
 from appliance.model.plane_api import Facts, FactsAsk, Known
 from appliance.model.robots import plausible, read_robot
 from appliance.plane.events import FactsChanged, FleetEvent, FleetEvents, Joined, Lost, Relinked, Stage
-from appliance.plane.membership import Membership, Namesakes
+from appliance.plane.membership import Membership, Namesakes, Versions
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Closer, Message, Session
 from appliance.plane.settings import PlaneConfig
@@ -573,7 +573,10 @@ class Registry:
         self._speaker: Speaker | None = None
         self.namesakes: Namesakes | None = None
         """Others that go by this gateway's id."""
+        self.versions: Versions | None = None
+        """Others that this gateway does not work beside."""
         if gateway is not None:
+            self.versions = Versions(session, own=lambda: self.gateways.get(gateway))
             self.namesakes = Namesakes(session, gateway, own=lambda: self.gateways.get(gateway))
             rpc.register(keyspace.FACTS, self._on_facts)
             self._speaker = Speaker(
@@ -714,6 +717,8 @@ class Registry:
         self._learn_status(gateway, status, age_s=status.age_ms / 1e3)
 
     def _learn_status(self, gateway: str, status: GatewayStatus, *, age_s: float) -> None:
+        if self.versions is not None and gateway != self._gateway:
+            self.versions.heard(status)
         self.gateways[gateway] = status
         if status.asked:
             self._asked_by[gateway] = status.asked

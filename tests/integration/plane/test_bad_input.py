@@ -7,6 +7,7 @@ import itertools
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 import zenoh
 
@@ -138,6 +139,29 @@ async def test_a_status_that_nobody_answers_for_displaces_nobody(
         assert one.registry.namesakes is not None
         assert not one.registry.namesakes.displaced.is_set()
         assert not one.session.refused
+
+
+async def test_a_gateway_whose_version_does_not_fit_goes(tmp_path: Path, free_ports: Callable[..., list[int]]) -> None:
+    """The one that came later, with what is to be upgraded; the other stays and counts it."""
+    async with _planes(tmp_path, free_ports(2), "f") as (one, other):
+        own = GatewayStatus(id="g1", fleet="f", started_ns=9, pid=1)
+        other.registry.publish_status(own)
+        goes = asyncio.create_task(other.displaced())
+        stays = asyncio.create_task(one.displaced())
+        # What a newer version, which was there first, says of itself, with fields that this one does not know.
+        newer = GatewayStatus(id="g0", fleet="f", version="3.0", protocol=3, oldest_protocol=2, started_ns=1, pid=1)
+        text = msgspec.json.decode(encode(newer), type=dict[str, object]) | {"later": {"a": [1]}}
+        key = one.session.keys(keyspace.STATUS, "g0")
+        async with asyncio.timeout(60):
+            while not goes.done():
+                one.session.put(key, encode(text))
+                await asyncio.sleep(0.1)
+        error = goes.result()
+        assert "speaks protocol 3" in error.message
+        assert "upgrade this gateway" in error.remedy
+        assert other.session.refused["incompatible gateway"]
+        assert not stays.done()
+        stays.cancel()
 
 
 @pytest.mark.parametrize("hours", [1, -1])
