@@ -2,6 +2,7 @@
 
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,8 +16,10 @@ from appliance.cli.common import TOOLS, Json, show
 from appliance.errors import ConfigError, Exit
 
 if TYPE_CHECKING:
+    from appliance.client import FleetClient
     from appliance.deploy.layout import Layout
     from appliance.deploy.upgrade import Ended, Upgrade
+    from appliance.model import GatewayStatus
 
 release_app = App(name="release", help="List, check and make releases of the program.", group=TOOLS)
 
@@ -51,6 +54,38 @@ class BundleShown(Struct, frozen=True, kw_only=True):
     images: tuple[str, ...]
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Whole:
+    """A whole fleet that is upgraded from one machine."""
+
+    fleet: Annotated[str, Parameter(help="Upgrade all gateways of this fleet, over ssh, one after the other.")] = ""
+    ssh: Annotated[
+        tuple[str, ...],
+        Parameter(help="GATEWAY=[USER@]HOST: machine of a gateway, for ssh; one for each. As root, or with sudo -n."),
+    ] = ()
+    connect: Annotated[
+        tuple[str, ...],
+        Parameter(env_var="SWIFTBOT_CONNECT", help="Endpoint of a gateway; name several, since each is restarted."),
+    ] = ()
+    keys: Annotated[
+        Path | None, Parameter(env_var="SWIFTBOT_KEYS", help="File with your keys, those of an engineer.")
+    ] = None
+
+    def targets(self) -> dict[str, str]:
+        """The machine of each gateway; ConfigError where one is named twice or not as it should be."""
+        found: dict[str, str] = {}
+        for each in self.ssh:
+            name, _, destination = each.partition("=")
+            if not name or not destination or destination.startswith("-") or name in found:
+                raise ConfigError(f"--ssh {each[:80]!r}", remedy="--ssh GATEWAY=root@HOST, once for each gateway")
+            found[name] = destination
+        return found
+
+
+WHOLE = Whole()
+
+
 def add_to(app: App) -> None:
     """Add these commands."""
     for command in (upgrade, rollback):
@@ -66,12 +101,14 @@ async def upgrade(
     older: bool = False,
     root: Root = HERE,
     config: ConfigFile = CONFIG,
+    whole: Whole = WHOLE,
     as_json: Json = False,
 ) -> int:
     """Install a signed bundle beside the release that runs, switch to it, and go back if it does not work.
 
     Services drain, stop, and start with the new release; then they must stay up, and `swiftbot doctor` must find
-    nothing that it did not find before. Run as root.
+    nothing that it did not find before. Run as root. With --fleet all gateways of a fleet, over ssh, one after the
+    other; the first that fails ends it.
 
     Args:
         file: Bundle, as `make bundle` writes it.
@@ -82,6 +119,10 @@ async def upgrade(
     from appliance.deploy import host
     from appliance.deploy.upgrade import Ended
 
+    if whole.fleet:
+        if file is None:
+            raise ConfigError("no bundle is named", remedy="swiftbot upgrade FILE --fleet NAME --ssh GATEWAY=HOST")
+        return await _roll(file, whole, older=older, as_json=as_json)
     upgrading = _upgrading(root, config)
     layout = _layout(root)
     if resume:
@@ -102,6 +143,47 @@ async def upgrade(
         _say(f"{file}: {bundle.manifest.release}, signature good; {running or 'nothing'} runs")
         release = await host.lay_out(bundle, layout, say=_say)
         return _show_ended(await upgrading.to(release), as_json=as_json)
+
+
+class _Fleet:
+    """A fleet's gateways, by a client."""
+
+    def __init__(self, client: "FleetClient") -> None:
+        self._client = client
+
+    def gateways(self) -> dict[str, "GatewayStatus"]:
+        members = self._client.plane.members()
+        return {name: each for name, each in self._client.plane.registry.gateways.items() if name in members}
+
+    async def drain(self, gateway: str) -> bool:
+        state = await self._client.drain_state(gateway)
+        if not state.draining:
+            state = await self._client.drain(gateway, 0.0, why="upgrade of the fleet")
+        return state.done
+
+    async def undrain(self, gateway: str) -> None:
+        await self._client.undrain(gateway, why="upgrade of the fleet")
+
+
+async def _roll(file: Path, whole: Whole, *, older: bool, as_json: bool) -> int:
+    from appliance.client import Endpoint, FleetClient
+    from appliance.deploy.bundle import release_in
+    from appliance.deploy.rolling import Ssh, roll
+
+    targets, release = whole.targets(), release_in(file)
+    if not whole.connect:
+        raise ConfigError("no gateway is named", remedy="--connect tls/ADDRESS:7447, several")
+    endpoint = Endpoint(fleet=whole.fleet, connect=whole.connect, keys=str(whole.keys or ""))
+    async with FleetClient(endpoint) as client:
+        await client.gateway()
+        rolled = await roll(_Fleet(client), Ssh(), targets, file, release=release, older=older, say=_say)
+    table = Table()
+    for column in ("gateway", "state", "release", "problem"):
+        table.add_column(column, overflow="fold")
+    for each in rolled:
+        table.add_row(each.gateway, each.state, each.release, each.problem)
+    show(rolled, as_json=as_json, table=table)
+    return Exit.FAILED if any(each.state != "upgraded" for each in rolled) else Exit.DONE
 
 
 async def rollback(*, root: Root = HERE, config: ConfigFile = CONFIG, as_json: Json = False) -> int:

@@ -303,6 +303,22 @@ class Bundle:
             raise PayloadError(f"{self.path}: {member.name} is damaged: another SHA-256", remedy=_COPY_AGAIN)
 
 
+def release_in(path: Path) -> str:
+    """Return the release that a bundle is of, as it says itself: its signature is not looked at.
+
+    Raises:
+        ConfigError: there is no such file, or it cannot be read.
+        PayloadError: it is no bundle.
+    """
+    try:
+        with tarfile.open(path, mode="r:") as tar:
+            return _manifest(path, _first(tar, path, MANIFEST, MOST_MANIFEST)).release
+    except (tarfile.TarError, EOFError) as error:
+        raise PayloadError(f"{path} is no bundle ({error})", remedy="`make bundle` makes one") from error
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}", remedy="name a bundle's file") from error
+
+
 @contextmanager
 def opened(path: Path, trusted: tuple[Ed25519PublicKey, ...]) -> Generator[Bundle]:
     """Open a bundle, its signature checked.

@@ -59,6 +59,7 @@ def test_what_goes_in_comes_out(tmp_path: Path, key: Ed25519PrivateKey) -> None:
     """Signed by one of the trusted keys, every file as it was; the same folder and time make the same bytes."""
     path = make(tmp_path, key)
     assert taken_out(path, key, tmp_path / "out") == FILES
+    assert bundles.release_in(path) == "2.0.0+abc"
     first = path.read_bytes()
     assert make(tmp_path, key).read_bytes() == first
 
