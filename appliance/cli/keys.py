@@ -343,6 +343,8 @@ def _show_issued(bundle: "Bundle", *, as_json: bool) -> None:
     lines = [f"issued {bundle.path} for {identity.text}, good until {_day(identity.not_after)}"]
     if identity.role is Role.GATEWAY and not hosts:
         lines.append("It is dialled on the loopback only; for other machines give --host.")
+    if identity.role is Role.GATEWAY:
+        lines.append("It runs only skills, images and models that are signed: swiftbot parts list, sign, install.")
     if identity.role in (Role.GATEWAY, Role.ROBOT):
         lines.append(
             "next: copy it to its machine, and give the fleet the roster: swiftbot keys publish --connect ENDPOINT"
