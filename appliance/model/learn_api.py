@@ -174,7 +174,7 @@ class Revealed(Struct, frozen=True, kw_only=True):
     y: str
 
 
-class LearnKeysAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LearnKeysAsk(Struct, frozen=True, kw_only=True):
     """`learn_keys`: make keys for clients of the asked gateway."""
 
     epoch: str
@@ -187,7 +187,7 @@ class LearnKeys(Struct, frozen=True, kw_only=True):
     keys: tuple[PublicKeys, ...]
 
 
-class LearnShareAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LearnShareAsk(Struct, frozen=True, kw_only=True):
     """`learn_share`: cut the secrets of the asked gateway's clients for a cohort."""
 
     cohort: Cohort
@@ -199,7 +199,7 @@ class LearnShares(Struct, frozen=True, kw_only=True):
     sealed: tuple[Sealed, ...]
 
 
-class LearnHoldAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LearnHoldAsk(Struct, frozen=True, kw_only=True):
     """`learn_hold`: this is the cohort, these are the shares of others for the asked gateway's clients."""
 
     cohort: Cohort
@@ -212,7 +212,7 @@ class LearnHeld(Struct, frozen=True, kw_only=True):
     clients: int
 
 
-class LearnUnmaskAsk(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LearnUnmaskAsk(Struct, frozen=True, kw_only=True):
     """`learn_unmask`: give away the shares that the sum of these clients' updates needs."""
 
     epoch: str

@@ -16,7 +16,7 @@ OF_PEOPLE = frozenset(
         "CancelTaskAsk",
         "MigrateAsk",
         "ScheduleSpec",
-        *("Recipe", "Data", "Clients", "Training", "Optimiser", "Rounds", "Update", "Evaluation", "Emulation"),
+        *("Recipe", "Data", "Clients", "Training", "Optimiser", "Rounds", "Update", "Dp", "Evaluation", "Emulation"),
     }
 )
 """What a person has ordered, which gateways pass on: what is not known there is refused, not left out."""
