@@ -75,6 +75,8 @@ lock: ready ## Pin the dependencies in locks/ again (UPGRADE=1: newest versions)
 	compile locks/tools.in -o locks/tools.txt && \
 	compile locks/docs.in -o locks/docs.txt && \
 	compile pyproject.toml --extra train -c locks/gateway.txt -o locks/train.txt && \
+	/usr/bin/python3 -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["report"], sep="\n")' \
+	  | compile - -c locks/gateway.txt -o locks/report.txt && \
 	compile pyproject.toml --extra foxglove -c locks/gateway.txt -o locks/foxglove.txt && \
 	/usr/bin/python3 -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["flower"], sep="\n")' \
 	  | compile - -o locks/flower.txt && \

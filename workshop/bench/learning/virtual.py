@@ -312,6 +312,7 @@ def _times(found: Outcome) -> dict[str, Any]:
     return {
         "round_s": summary([each * 1e3 for each in took]),
         "p50_s": round(median(took[1:] or took), 4),
+        "took_s": took,
         "first_s": took[0],
         "whole_s": round(sum(took), 3),
         "late": found.late,

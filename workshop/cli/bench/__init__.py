@@ -2,10 +2,10 @@
 
 from cyclopts import App
 
-from workshop.cli.bench import learning, plane, pools, robots, work
+from workshop.cli.bench import learning, paper, plane, pools, robots, work
 from workshop.cli.bench.common import bench_app
 
-__all__ = ["add_to", "learning", "plane", "pools", "robots", "work"]
+__all__ = ["add_to", "learning", "paper", "plane", "pools", "robots", "work"]
 
 
 def add_to(app: App) -> None:
