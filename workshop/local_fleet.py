@@ -42,6 +42,12 @@ from appliance.skills.catalogue import load_catalogue
 from workshop import keyring
 
 Progress = Callable[[str], None]
+MOST_DRONES = 240
+"""MAVLink has 255 systems; a gateway is one, ground stations are others."""
+OWN_PROCESS = 8
+"""Up to so many simulated MAVLink vehicles have a process each, which can be killed; more are in one."""
+DRONES = "drones"
+"""The name of that process."""
 
 
 class Ended(Struct, frozen=True, kw_only=True):
@@ -108,6 +114,8 @@ async def up(order: Order, *, progress: Progress, timeout_s: float = 60.0) -> Fl
     check_name(order.fleet, "fleet")
     if not 1 <= order.gateways <= 16:
         raise ConfigError(f"{order.gateways} gateways", remedy="a local fleet has 1 to 16")
+    if not 0 <= order.mavlink <= MOST_DRONES:
+        raise ConfigError(f"{order.mavlink} MAVLink vehicles", remedy=f"a local fleet has 0 to {MOST_DRONES}")
     if order.secured and order.zenoh:
         raise ConfigError(
             "simulated Zenoh robots share a world on keys that no role may use",
@@ -176,15 +184,17 @@ class _Starting:
                 keyring.sign_parts(keys_folder(directory), config)
             self._spawn(name, "gateway", "--config", str(path))
         self._spawn("recorder", "record", "--config", str(directory / names[0] / "gateway.toml"))
-        for number, drone in enumerate(drones):
+        together = len(drones) > OWN_PROCESS
+        for name, numbers in (
+            [(DRONES, range(len(drones)))] if together else [(drone, [at]) for at, drone in enumerate(drones)]
+        ):
             self._spawn(
-                drone,
+                name,
                 "sim",
                 "mavlink",
-                "--to",
-                f"udp://127.0.0.1:{udp_ports[number]}",
+                *(each for at in numbers for each in ("--to", f"udp://127.0.0.1:{udp_ports[at]}")),
                 "--system",
-                str(number + 1),
+                str(numbers[0] + 1),
                 "--site",
                 order.site,
                 "--rate",
@@ -373,7 +383,7 @@ async def down(
         if left is None or not (left.removed_volumes or left.kept_volumes or left.problem):
             raise
         return msgspec.structs.replace(left, directory=str(directory))
-    robots = [each for each in state.processes if each.name in state.robots]
+    robots = [each for each in state.processes if each.name in (*state.robots, DRONES)]
     gateways = [each for each in state.processes if each.name in state.gateways]
     rest = [each for each in state.processes if each not in robots and each not in gateways]
     for group, what in ((robots, "robots"), (gateways, "gateways"), (rest, "recorder")):

@@ -61,7 +61,7 @@ def up(
 
     Args:
         gateways: How many gateways.
-        robots: How many simulated robots of each kind.
+        robots: How many simulated robots of each kind; more than 8 MAVLink vehicles are in one process.
         site: Built-in site or site file.
         skills: Folder with further skills and images.
         rate: How many times faster than real the simulated robots move.

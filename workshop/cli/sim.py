@@ -20,7 +20,8 @@ def add_to(app: App) -> None:
 @sim_app.command
 def mavlink(
     *,
-    to: str,
+    to: tuple[str, ...],
+    vehicles: int = 0,
     listen: bool = False,
     system: int = 1,
     site: str = "warehouse",
@@ -34,12 +35,13 @@ def mavlink(
     delay_s: float = 0.0,
     seed: int = 1,
 ) -> int:
-    """Simulate a MAVLink vehicle that sends to a gateway, or waits for one.
+    """Simulate MAVLink vehicles that send to a gateway, or wait for one.
 
     Args:
-        to: Where the gateway listens, udp://host:port or tcp://host:port.
+        to: Where the gateway listens, udp://host:port or tcp://host:port; repeatable, vehicles take them by turns.
+        vehicles: How many, in this one process; 0: one for each --to.
         listen: Listen there (tcp), as SITL does, and let the gateway connect.
-        system: MAVLink system id, 1 to 255.
+        system: MAVLink system id, 1 to 255, of the first vehicle; the others count on.
         site: Built-in site or site file.
         rate: How many times faster than real it moves.
         start: Place it starts at.
@@ -52,27 +54,31 @@ def mavlink(
         seed: Of the link's chances: the same one loses the same frames.
     """
     from appliance.skills.sites import load_site
-    from workshop.robots.mavlink import VehicleSettings, read_parameters, run_vehicle
+    from workshop.robots.mavlink import VehicleSettings, read_parameters, run_vehicles
 
     logs.configure(style="text")
-    settings = VehicleSettings(
-        to=to,
-        listen=listen,
-        system=system,
-        site=load_site(site),
-        rate=rate,
-        start=start,
-        kind=kind,
-        parameters=read_parameters(parameter),
-        drop=drop,
-        double=double,
-        mix=mix,
-        delay_s=delay_s,
-        seed=seed,
-    )
+    ground = load_site(site)
+    settings = [
+        VehicleSettings(
+            to=to[number % len(to)],
+            listen=listen,
+            system=system + number,
+            site=ground,
+            rate=rate,
+            start=start,
+            kind=kind,
+            parameters=read_parameters(parameter),
+            drop=drop,
+            double=double,
+            mix=mix,
+            delay_s=delay_s,
+            seed=seed + number,
+        )
+        for number in range(vehicles or len(to))
+    ]
 
     async def go() -> None:
-        await run_vehicle(settings, stop=until_signalled())
+        await run_vehicles(settings, stop=until_signalled())
 
     asyncio.run(go())
     return 0

@@ -1,4 +1,4 @@
-"""A simulated MAVLink vehicle as a process of its own: it sends to a gateway, as SITL's `--out` does, or waits for one.
+"""Simulated MAVLink vehicles, one or many in a process: they send to a gateway, as SITL's `--out` does, or wait for it.
 
 Its link can be made bad in the ways radio links are (`air`), the same each way.
 """
@@ -118,6 +118,17 @@ async def run_vehicle(settings: VehicleSettings, *, stop: asyncio.Event | None =
     await Simulation(settings, make_vehicle(settings)).run(asyncio.Event() if stop is None else stop)
 
 
+async def run_vehicles(settings: Sequence[VehicleSettings], *, stop: asyncio.Event) -> None:
+    """Simulate several until `stop` is set; ConfigError for one that cannot be, before any begins."""
+    for each in settings:
+        each.check()
+    simulations = [Simulation(each, make_vehicle(each)) for each in settings]
+    async with asyncio.TaskGroup() as group:
+        for number, simulation in enumerate(simulations):
+            # Each tick of so many at the same moment would come to the gateway as one burst.
+            group.create_task(simulation.run(stop, after_s=TICK_S * number / len(simulations)))
+
+
 def make_vehicle(settings: VehicleSettings) -> AnyAutopilot:
     """Make the vehicle that the settings describe; ConfigError for a parameter that it does not have."""
     kind = SimCopter if settings.kind == "copter" else SimRover
@@ -149,8 +160,9 @@ class Simulation:
         self._link: Link | None = None
         self._codecs: dict[int, Codec] = {}
 
-    async def run(self, stop: asyncio.Event) -> None:
-        """Run until `stop` is set."""
+    async def run(self, stop: asyncio.Event, *, after_s: float = 0.0) -> None:
+        """Run until `stop` is set, beginning in so long."""
+        await asyncio.sleep(after_s)
         signer = Signer(read_key(self._settings.signing), link_id=0) if self._settings.signing else None
         for number in (dialect.COMPONENT_AUTOPILOT, *(part.number for part in self.parts)):
             self._codecs[number] = Codec(self._settings.system, number, signer=signer)
