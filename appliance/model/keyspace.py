@@ -190,7 +190,8 @@ LINK_FRAMES = Topic(
     "gw/{gateway}/mavlink/{link}/{direction}",
     Untyped,
     "one raw MAVLink frame, not JSON, of the link with that number",
-    writer="that gateway; `rx` heard from, `tx` sent to an end that is no vehicle (a ground station, a stranger)",
+    writer="that gateway; `rx` heard from, `tx` sent to an end that is no vehicle (a ground station, a stranger); what "
+    "is for everybody and only passed on stands once, as heard, and `mavlink/links` counts where it went",
     often="per frame",
     kept="in logs only",
     puts=GATEWAYS,

@@ -226,6 +226,9 @@ class LinkFacts(Struct, frozen=True, kw_only=True, omit_defaults=True):
     out_bytes_s: float = 0.0
     refused: dict[str, int] = field(default_factory=dict[str, int])
     """Damaged and unbelieved frames, floods, and what could not be sent, by kind."""
+    passed: dict[str, int] = field(default_factory=dict[str, int])
+    """Frames for everybody that were passed on to it since it was opened, by their sender (`1/1`): in the log they
+    stand once, as they were heard."""
     damped: tuple[str, ...] = ()
     """Messages that come in a storm just now and are cut, with their senders: `PARAM_VALUE of 1/1`."""
     senders: tuple[SenderFacts, ...] = ()

@@ -22,6 +22,7 @@ def mavlink(
     *,
     to: tuple[str, ...],
     vehicles: int = 0,
+    streams: float = 1.0,
     listen: bool = False,
     system: int = 1,
     site: str = "warehouse",
@@ -40,6 +41,7 @@ def mavlink(
     Args:
         to: Where the gateway listens, udp://host:port or tcp://host:port; repeatable, vehicles take them by turns.
         vehicles: How many, in this one process; 0: one for each --to.
+        streams: How many times as often as usual it sends each kind of telemetry, up to ten times a second.
         listen: Listen there (tcp), as SITL does, and let the gateway connect.
         system: MAVLink system id, 1 to 255, of the first vehicle; the others count on.
         site: Built-in site or site file.
@@ -65,6 +67,7 @@ def mavlink(
             system=system + number,
             site=ground,
             rate=rate,
+            streams=streams,
             start=start,
             kind=kind,
             parameters=read_parameters(parameter),

@@ -50,6 +50,8 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
     """Place it starts at, and its home; the site's origin where there is no such place."""
     rate: float = 1.0
     """How many times faster than real it moves."""
+    streams: float = 1.0
+    """How many times as often as usual it sends each kind of telemetry, up to once a tick."""
     battery_percent: float = 100.0
     drop: float = 0.0
     """Share of frames lost, each way."""
@@ -83,6 +85,8 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
             raise ConfigError(f"MAVLink system id {self.system}", remedy="use 1 to 255")
         if not (math.isfinite(self.rate) and 0.0 < self.rate <= 100.0):
             raise ConfigError(f"rate {self.rate:g}", remedy="use more than 0, at most 100")
+        if not (math.isfinite(self.streams) and 0.0 < self.streams <= 100.0):
+            raise ConfigError(f"streams {self.streams:g}", remedy="use more than 0, at most 100")
         self.air.check()
 
 
@@ -155,7 +159,7 @@ class Simulation:
         self._settings = settings
         self._down: Channel[bytes] = Channel(settings.air, direction=0)
         self._up: Channel[Frame] = Channel(settings.air, direction=1)
-        self._intervals = {name: 1.0 / hz for name, hz in STREAMS_HZ.items()}
+        self._intervals = {name: 1.0 / (hz * settings.streams) for name, hz in STREAMS_HZ.items()}
         self._due = dict.fromkeys(STREAMS_HZ, 0.0)
         self._link: Link | None = None
         self._codecs: dict[int, Codec] = {}

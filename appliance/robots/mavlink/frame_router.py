@@ -17,7 +17,7 @@ from appliance.plane.session import Publisher, Session
 from appliance.robots.mavlink.dialect import MARKER_V2, Frame, Message
 from appliance.robots.mavlink.link_manager import LinkManager, OpenLink
 from appliance.robots.mavlink.links import Address
-from appliance.robots.mavlink.routing import End, Kind, RoutingTable
+from appliance.robots.mavlink.routing import BROADCAST, End, Kind, RoutingTable
 from appliance.robots.mavlink.vehicle import is_autopilot
 from appliance.robots.settings import RobotsConfig
 
@@ -120,7 +120,7 @@ class FrameTap:
 
 
 class FrameSender:
-    """The way out: the gateway's own messages and what is passed on, each recorded."""
+    """The way out: the gateway's own messages and what is passed on, each recorded once."""
 
     def __init__(self, config: RobotsConfig, *, links: LinkManager, routing: RoutingTable, tap: FrameTap) -> None:
         self._config = config
@@ -129,13 +129,20 @@ class FrameSender:
         self._tap = tap
 
     def pass_on(self, frame: Frame, ends: Sequence[End]) -> None:
-        """Send a frame to other ends."""
+        """Send a frame to other ends.
+
+        What is meant for one is recorded there too. What is meant for all has been recorded as it was heard; where it
+        went is counted (`LinkFacts.passed`): with a copy for each station the log would be mostly copies.
+        """
         for end in ends:
             entry = self._links.get(end.link)
             if entry is not None:
                 raw = entry.link.codec.pass_on(frame)
                 entry.link.transmit(raw, end.address)
-                self._tap.sent(end, raw)
+                if frame.target_system == BROADCAST:
+                    entry.link.stats.passed_on(frame.system, frame.component)
+                else:
+                    self._tap.sent(end, raw)
 
     def send(self, end: End, message: Message, *, vehicle: str | None = None, system: int | None = None) -> None:
         """Send the gateway's own message.

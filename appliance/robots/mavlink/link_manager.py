@@ -336,6 +336,7 @@ class LinkManager:
             in_bytes_s=in_bytes_s,
             out_bytes_s=out_bytes_s,
             refused=dict(link.damaged),
+            passed={f"{system}/{component}": count for (system, component), count in sorted(stats.passed.items())},
             damped=tuple(f"{name} of {system}/{component}" for system, component, name in sorted(entry.damper.damped)),
             senders=tuple(
                 SenderFacts(

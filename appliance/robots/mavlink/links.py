@@ -130,6 +130,8 @@ class LinkStats:
         self.frames_in = self.bytes_in = self.frames_out = self.bytes_out = 0
         self.repeated = 0
         self.senders: OrderedDict[tuple[int, int], Sender] = OrderedDict()
+        self.passed: OrderedDict[tuple[int, int], int] = OrderedDict()
+        """Frames for everybody that went out here, by their sender; of few senders, the one silent for longest goes."""
         self.latency: OrderedDict[Address, Latency] = OrderedDict()
         self.meter = Meter(now)
         self._asked: OrderedDict[tuple[Address, int], int] = OrderedDict()
@@ -142,6 +144,12 @@ class LinkStats:
                 del self.senders[min(self.senders, key=lambda each: self.senders[each].heard_at)]
             found = self.senders[system, component] = Sender()
         return found
+
+    def passed_on(self, system: int, component: int) -> None:
+        """Note that a frame for everybody went out here, as its sender sent it."""
+        self.passed[system, component] = self.passed.pop((system, component), 0) + 1
+        if len(self.passed) > MAX_SENDERS:
+            self.passed.popitem(last=False)
 
     def look(self, now: float) -> None:
         """Bring the rates up to date."""
