@@ -203,7 +203,6 @@ class Takeover:
                 break
             at_work.append((task.submitter, task.priority))
             self._begin(task)
-        self._changed()
 
     def _begin(self, task: Waiting) -> "asyncio.Task[None]":
         self._beginning[task.id] = task

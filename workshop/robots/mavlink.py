@@ -181,7 +181,7 @@ class Simulation:
                 before = now
                 self._arrived(now)
                 self._tick(dt, now, round((now - began) * 1000))
-                self._transmit(now)
+                self._transmit(time.monotonic())
                 try:
                     async with asyncio.timeout(TICK_S):
                         await stop.wait()
@@ -219,7 +219,7 @@ class Simulation:
         now = time.monotonic()
         self._up.send(frame, now)
         self._arrived(now)
-        self._transmit(now)
+        self._transmit(time.monotonic())
 
     def _arrived(self, now: float) -> None:
         """Act on what has come through the air."""
