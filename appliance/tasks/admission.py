@@ -32,9 +32,11 @@ ENDS = 32
 """Ends of tasks from which the rate is measured: enough for a mean, few enough to follow a change."""
 LONGEST_RETRY_S = 600.0
 """Nobody is sent away for longer: so far ahead the rate says nothing."""
-SLOW_S, SLOWER = 0.03, 4.0
+SLOW_S, SLOWER = 0.03, 2.0
 """Acceptances are slow that take longer on average, and so many times as long as the quickest one: on an idle machine
 one takes 5 to 10 ms."""
+LATE_S = 0.01
+"""An event loop that is later has no processor left; on an idle machine it is 1 ms late."""
 RECENT_S = 0.5
 """So long after the last acceptance it does not matter any more how long they took."""
 SHORTEST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
@@ -129,10 +131,13 @@ class Admission:
         self._last = -math.inf
         """When the last one ended."""
 
-    def slow(self, now: float) -> bool:
-        """Whether tasks are being accepted just now, and that takes long."""
-        least_s = max(SLOW_S, SLOWER * self._quickest_s)
-        return self._took_s > least_s and (bool(self._coming) or now - self._last < RECENT_S)
+    def slow(self, now: float, late_s: float) -> bool:
+        """Whether tasks are being accepted just now, and that takes long, or all here does.
+
+        `late_s`: how late the event loop is of late.
+        """
+        slow = self._took_s > max(SLOW_S, SLOWER * self._quickest_s) or late_s > LATE_S
+        return slow and (bool(self._coming) or now - self._last < RECENT_S)
 
     @contextlib.contextmanager
     def one_more(self, task: str, unfinished: int) -> Generator[None]:

@@ -96,7 +96,7 @@ class Takeover:
         coordinators: by task; kept here.
         sweep: set to have the shard looked through at once.
         ages: of the tasks whose records are seen.
-        slow: whether acceptances are slow, by the monotonic clock.
+        slow: whether acceptances are slow, by the monotonic clock and how late the event loop is.
         moved: gets each record that a coordinator has written.
         ended: gets each coordinator that has come to its end.
         changed: called when the coordinators are other ones.
@@ -109,7 +109,7 @@ class Takeover:
         *,
         sweep: asyncio.Event,
         ages: Ages,
-        slow: Callable[[float], bool],
+        slow: Callable[[float, float], bool],
         moved: Callable[[TaskRecord], None],
         ended: Callable[[Coordinator], None],
         changed: Callable[[], None],
@@ -122,6 +122,8 @@ class Takeover:
         self._plane = context.plane
         self._ages = ages
         self._slow = slow
+        self._late_s = 0.0
+        """How late the event loop is, a mean of the last half second."""
         self._moved = moved
         self._ended = ended
         self._changed = changed
@@ -169,7 +171,7 @@ class Takeover:
         if record.id in self or self._stopping:
             return
         now = time.monotonic()
-        full = len(self.queue) > 0 or self.at_work >= self._context.config.max_tasks or self._slow(now)
+        full = len(self.queue) > 0 or self.at_work >= self._context.config.max_tasks or self._slow(now, self._late_s)
         if record.state is not TaskState.ACCEPTED or not full:
             self.drive(record, version, value)
             return
@@ -196,7 +198,7 @@ class Takeover:
         def busy(submitter: str, priority: int) -> int:
             return sum(name == submitter and of >= priority for name, of in at_work)
 
-        apart_s = APART_S if self._slow(now) else 0.0
+        apart_s = APART_S if self._slow(now, self._late_s) else 0.0
         while self.at_work < 2 * most:
             task = self.queue.next(now, room=self.at_work < most, busy=busy, apart_s=apart_s)
             if task is None:
@@ -245,7 +247,9 @@ class Takeover:
 
     async def _keep_turning(self) -> None:
         while True:
+            due = time.monotonic() + TURN_S
             await asyncio.sleep(TURN_S)
+            self._late_s += 0.2 * (time.monotonic() - due - self._late_s)
             self._give_turns()
 
     def drive(self, record: TaskRecord, version: VersionVector, value: bytes = b"") -> None:

@@ -23,6 +23,8 @@ from msgspec import Struct
 
 from appliance.pool.fair_queue import AGING_S
 
+JUST_NOW_S = 1.0
+"""For so long it is remembered when a sender was served of which none waits: longer than turns are kept apart."""
 RESERVED = 2
 """Tasks of one sender that are taken up although others fill the places: one that runs, and one that ends just now."""
 
@@ -59,9 +61,9 @@ class TaskQueue:
         self._senders: dict[str, _Sender] = {}
         self._present = 0.0
         """Virtual time: when the one served last began."""
-        self._served: dict[str, float] = {}
-        """Sender of which none waits -> virtual time at which its next begins; those not ahead of the present are left
-        out."""
+        self._gone: dict[str, tuple[float, float]] = {}
+        """Sender of which none waits -> virtual time at which its next begins, and when it was served last; those that
+        are neither ahead of the present nor were served just now are left out."""
         self._due: list[tuple[float, str]] = []
 
     def __len__(self) -> int:
@@ -83,8 +85,8 @@ class TaskQueue:
         self._waiting[task.id] = task
         sender = self._senders.get(task.submitter)
         if sender is None:
-            start = self._served.pop(task.submitter, self._present)
-            sender = self._senders[task.submitter] = _Sender([], now, -math.inf, start)
+            start, served = self._gone.pop(task.submitter, (self._present, -math.inf))
+            sender = self._senders[task.submitter] = _Sender([], now, served, start)
         heapq.heappush(sender.heap, (-task.priority, task.due_at, task.accepted_ns, task.id))
         sender.count += 1
         if task.due_at < math.inf:
@@ -98,7 +100,7 @@ class TaskQueue:
             sender.count -= 1
             if not sender.count:
                 del self._senders[found.submitter]
-                self._served[found.submitter] = sender.start
+                self._gone[found.submitter] = sender.start, sender.served
         return found
 
     def next(self, now: float, *, room: bool, busy: Callable[[str, int], int], apart_s: float = 0.0) -> Waiting | None:
@@ -128,7 +130,9 @@ class TaskQueue:
         sender = self._senders[self._waiting[task].submitter]
         sender.since, sender.served, sender.start = now, now, start + 1.0
         found = self.remove(task)
-        self._served = {name: at for name, at in self._served.items() if at > start}
+        self._gone = {
+            name: (at, served) for name, (at, served) in self._gone.items() if at > start or now - served < JUST_NOW_S
+        }
         return found
 
     def _first(self, sender: _Sender) -> Waiting:

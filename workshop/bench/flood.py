@@ -111,8 +111,8 @@ async def run(options: Options, *, progress: Progress) -> dict[str, Any]:
 
     Returns:
         `accepted`, `rate_per_s`, `submission` (ms), `order_start` (ms), `reads` (ms), what was `refused` to whom, what
-        gateways used (`cpu_ms_per_task`, `memory_mb` grown by, `waiting` at the end), `warnings` in their logs of slow
-        replicas, the `load` of the machine before, and `targets`.
+        gateways used (`cpu_ms_per_task`, `memory_mb` grown by), tasks `waiting` when the last was accepted and
+        `ended_meanwhile`, `warnings` in the logs of slow replicas, the `load` of the machine before, and `targets`.
 
     Raises:
         SwiftbotError: the fleet does not come up, or does not answer any more.
@@ -168,13 +168,15 @@ async def _flood(
                 progress(f"{len(took_ms):,} accepted after {time.monotonic() - start:.1f} s")
         seconds = time.monotonic() - start
         used_s = _cpu_s(processes) - cpu
+        gateways = other.plane.registry.gateways
+        waiting = {name: each.tasks_waiting for name, each in sorted(gateways.items())}
+        unfinished = sum(each.tasks for each in gateways.values())
         grown = max(now.memory_info().rss - before for now, before in zip(processes, memory, strict=True))
         await asyncio.sleep(2 * ORDER_EVERY_S)  # the last orders start, and gateways tell how they stand
     finally:
         for each in beside:
             each.cancel()
         await asyncio.gather(*beside, return_exceptions=True)
-    waiting = {name: each.tasks_waiting for name, each in sorted(other.plane.registry.gateways.items())}
     found: dict[str, Any] = {
         "tasks": options.tasks,
         "gateways": options.gateways,
@@ -188,6 +190,7 @@ async def _flood(
         "cpu_ms_per_task": round(used_s * 1e3 / max(1, len(took_ms)), 1),
         "memory_mb": round(grown / 2**20, 1),
         "waiting": waiting,
+        "ended_meanwhile": max(0, len(took_ms) - unfinished),
     }
     return found | {"targets": targets(found)}
 

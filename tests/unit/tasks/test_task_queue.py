@@ -161,6 +161,16 @@ def test_turns_of_one_sender_can_be_kept_apart() -> None:
     assert [turn(0.05), turn(0.1), turn(0.1), turn(0.15)].count("") == 2
 
 
+def test_turns_are_kept_apart_also_of_a_sender_of_which_one_waits_at_a_time() -> None:
+    """What comes while the last one has just had its turn waits for the pause, however short the line is."""
+    queue, had = TaskQueue(), 0
+    for number in range(100):
+        now = 0.01 * number
+        queue.add(waiting(f"t{number}"), now)
+        had += queue.next(now, room=True, busy=nobody, apart_s=0.25) is not None
+    assert had == 4
+
+
 def test_a_task_whose_deadline_passes_is_taken_out() -> None:
     """Its coordinator has to end it; one that was taken out already is not given again."""
     queue = TaskQueue()
