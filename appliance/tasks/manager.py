@@ -82,6 +82,11 @@ AGAIN_S = (0.5, 1.5, 4.0)
 """When the shard is looked through again after the ring has changed."""
 TURN_S = 0.1
 """How often it is looked whose turn it is."""
+MOST_IN_LINE = 16
+"""Subtasks that wait for room, beyond which no more tasks of the same submitters are taken up: they would only wait
+elsewhere, and each that waits is looked at again and again."""
+MOST_AT_ONCE = 4
+"""Tasks taken up at one look: a few dozen a second."""
 APART_S = 0.25
 """Between two turns of one submitter while acceptances are slow."""
 READ_AT_ONCE = 200
@@ -171,7 +176,7 @@ class Takeover:
         if record.id in self or self._stopping:
             return
         now = time.monotonic()
-        full = len(self.queue) > 0 or self.at_work >= self._context.config.max_tasks or self._slow(now, self._late_s)
+        full = len(self.queue) > 0 or not self._room() or self._slow(now, self._late_s)
         if record.state is not TaskState.ACCEPTED or not full:
             self.drive(record, version, value)
             return
@@ -184,6 +189,13 @@ class Takeover:
         )
         self.queue.add(waiting, now)
         self._give_turns()
+
+    def _room(self) -> bool:
+        """Whether there is a place for one more task."""
+        return (
+            self.at_work < self._context.config.max_tasks
+            and len(self._context.scheduler.line) + len(self._beginning) < MOST_IN_LINE
+        )
 
     def _give_turns(self) -> None:
         """Take up the tasks whose turn it is."""
@@ -199,8 +211,10 @@ class Takeover:
             return sum(name == submitter and of >= priority for name, of in at_work)
 
         apart_s = APART_S if self._slow(now, self._late_s) else 0.0
-        while self.at_work < 2 * most:
-            task = self.queue.next(now, room=self.at_work < most, busy=busy, apart_s=apart_s)
+        for _ in range(MOST_AT_ONCE):
+            if self.at_work >= 2 * most:
+                break
+            task = self.queue.next(now, room=self._room(), busy=busy, apart_s=apart_s)
             if task is None:
                 break
             at_work.append((task.submitter, task.priority))

@@ -281,6 +281,19 @@ async def test_tasks_beyond_the_places_wait_and_are_taken_up_when_one_ends(small
     assert (small.unfinished, small.waiting) == (3, 1)
 
 
+async def test_no_more_is_taken_up_than_there_is_room_to_run(
+    manager: TaskManager, plane: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While subtasks wait for room, tasks wait for their turn, but for the few that each submitter has at work."""
+    monkeypatch.setattr(module, "MOST_IN_LINE", 0)
+    for number in range(6):
+        await manager.submit(wish(plane, f"t-{number}"))
+    await until(lambda: manager.waiting == 4)
+    assert manager.unfinished == 6
+    monkeypatch.setattr(module, "MOST_IN_LINE", 16)
+    await until(lambda: manager.waiting == 0)
+
+
 async def test_the_task_of_another_submitter_does_not_wait_for_a_flood(small: TaskManager, plane: Any) -> None:
     """The places are full of one submitter's: another's goes at once, and so does an order of higher priority."""
     for number in range(5):
