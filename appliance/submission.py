@@ -17,7 +17,9 @@ from appliance.model import TaskRecord, TaskRequest
 
 TARGET_S = 0.15
 """How long a submission should take; beyond it fewer are under way at once."""
-MOST_AT_ONCE = 64
+LEAST_AT_ONCE, MOST_AT_ONCE = 8, 64
+"""Under way at once: so few are no burden even to a fleet that has no time, and enough for it to see that tasks are
+being handed in, which it puts before taking them up."""
 TRIES = 3
 """How often one is handed in to a fleet that does not answer; each time gateways are looked for."""
 
@@ -26,7 +28,7 @@ class Pace:
     """How many submissions may be under way at once, by how the last ones went. Pure; the clock is passed in."""
 
     def __init__(self) -> None:
-        self._window = 4.0
+        self._window = float(LEAST_AT_ONCE)
         self.until = 0.0
         """Until when nothing is handed in, on the monotonic clock: a gateway has said so."""
         self.waits = ""
@@ -41,12 +43,12 @@ class Pace:
         if took_s <= TARGET_S:
             self._window = min(MOST_AT_ONCE, self._window + 1 / self._window)
         else:
-            self._window = max(1.0, self._window - 0.3)
+            self._window = max(LEAST_AT_ONCE, self._window - 0.3)
 
     def sent_away(self, error: RefusedError, now: float) -> None:
         """One is to come back later."""
         if now >= self.until:  # of those that were under way together only the first makes it slower
-            self._window = max(1.0, self._window / 2)
+            self._window = max(LEAST_AT_ONCE, self._window / 2)
         self.until, self.waits = max(self.until, now + error.retry_after_s), str(error)
 
 

@@ -37,7 +37,7 @@ SLOW_S, SLOWER = 0.03, 2.0
 one takes 5 to 10 ms."""
 LATE_S = 0.01
 """An event loop that is later has no processor left; on an idle machine it is 1 ms late."""
-RECENT_S = 0.5
+RECENT_S = 2.0
 """So long after the last acceptance it does not matter any more how long they took."""
 SHORTEST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
 """Within these one comes back that has come while too many others were being taken."""
