@@ -291,8 +291,7 @@ class Gateway:
 
         await self._start_planner(catalogue)
 
-        recorders = self.plane.session.subscribe_typed(keyspace.RECORDER_STATUS, self._hear_recorder)
-        self._stack.callback(recorders.close)
+        self._stack.callback(self.plane.session.subscribe_typed(keyspace.RECORDER_STATUS, self._hear_recorder).close)
 
         audit = Audit(self.plane.session, self.plane.keys, config.id)
         self._stack.callback(audit.listen().close)
@@ -314,7 +313,7 @@ class Gateway:
         enquiries = Enquiries(self.plane)
         enquiries.start(audit)
         self._stack.push_async_callback(enquiries.close)
-        telling = Telling(self.plane, on_event=both(self._kept.hear_event, observer and observer.hear_event))
+        telling = Telling(self.plane, both(self._kept.hear_event, observer and observer.hear_event))
         self._calls = calls = Calls(
             self.plane,
             artifacts,
@@ -389,6 +388,7 @@ class Gateway:
             on_change=self._changed.set,
             on_transition=both(self._kept.hear_transition, observer and observer.hear_transition),
             on_record=both(self._alerts.moved, observer and observer.hear_record),
+            runs=telling,
         )
         rpc.register(keyspace.TASK_LINES, self._kept.answer)
         await self.manager.start()

@@ -37,15 +37,20 @@ MOST_RUNS = 4000
 
 
 class Telling:
-    """Publishes the events of one gateway's runs; `on_event` gets each of them too."""
+    """Publishes the events of one gateway's runs; its parts hear them at once, without the way over Zenoh."""
 
-    def __init__(self, plane: Plane, *, on_event: Callable[[RunEvent], None] = lambda _: None) -> None:
+    def __init__(self, plane: Plane, *listeners: Callable[[RunEvent], None]) -> None:
         self._plane = plane
-        self._on_event = on_event
+        self._listeners = [*listeners]
         self._numbers: OrderedDict[tuple[str, str, int], int] = OrderedDict()
         self._heard: dict[tuple[str, str, int], float] = {}
         self._progress: dict[tuple[str, str, int], float] = {}
         """Of the run, as it said last."""
+
+    def listen(self, listener: Callable[[RunEvent], None]) -> Callable[[], None]:
+        """Call a part of this gateway with each event; returns what ends that."""
+        self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
 
     def tell(self, event: RunEvent) -> None:
         """Publish an event."""
@@ -63,7 +68,8 @@ class Telling:
             self._progress.pop(oldest, None)
         event = replace(event, number=number, at_ns=time.time_ns())
         self._plane.session.publish(keyspace.RUN_EVENT, event, event.task, event.subtask, express=True)
-        self._on_event(event)
+        for listener in self._listeners:
+            listener(event)
 
     def waits(self, call: Call, note: str) -> None:
         """Publish that a run waits for something, as its progress."""

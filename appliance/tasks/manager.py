@@ -53,6 +53,7 @@ from appliance.tasks.context import FREE, Commands, Context
 from appliance.tasks.coordinator import Coordinator
 from appliance.tasks.endpoints import OperatorVerbs, Questions
 from appliance.tasks.events import GatewayLost, GatewayRelinked, RunReported, Wake
+from appliance.tasks.executor import Telling
 from appliance.tasks.lookahead import LookAhead
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.plans import Plans
@@ -470,8 +471,11 @@ class TaskManager:
         on_change: Callable[[], None] = lambda: None,
         on_transition: Callable[[Transition], None] = lambda _: None,
         on_record: Callable[[TaskRecord], None] = lambda _: None,
+        runs: Telling | None = None,
     ) -> None:
+        """`runs`: where the events of this gateway's own runs are heard; without, over Zenoh."""
         self.config = config
+        self._runs = runs
         self.plane = plane
         self._audit = audit or Audit(plane.session, plane.keys, plane.gateway)
         self._ages = Ages()
@@ -590,6 +594,8 @@ class TaskManager:
             heed=lambda key: keyspace.RUN_EVENT.names(key)[0] in self._coordinators,
         )
         self._closers.append(news.close)
+        if self._runs is not None:
+            self._closers.append(self._runs.listen(self._on_own_run_event))
         self._closers.append(self.plane.session.subscribe(self.plane.keys(keyspace.TASK_UPDATE), self._ages.hear).close)
         self._closers.append(self.plane.events.subscribe(Stage.TASKS, self._on_fleet_event))
         await self._ahead.durations.load()
@@ -709,7 +715,12 @@ class TaskManager:
         if not key.endswith(f"/task/{event.task}/run/{event.subtask}") or not self.plane.sees(event.gateway):
             self.plane.session.refuse("forged run event", key=key, reason=f"from {clean(event.gateway, 80)!r}")
             return
-        coordinator.put(RunReported(event))
+        if self._runs is None or event.gateway != self.plane.gateway:
+            coordinator.put(RunReported(event))
+
+    def _on_own_run_event(self, event: RunEvent) -> None:
+        if (coordinator := self._coordinators.get(event.task)) is not None:
+            coordinator.put(RunReported(event))
 
     def _on_fleet_event(self, event: FleetEvent) -> None:
         match event:

@@ -19,6 +19,7 @@ from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.model import (
     Approval,
     Decision,
+    GatewayStatus,
     Plan,
     RobotInfo,
     RunEvent,
@@ -40,6 +41,7 @@ from appliance.plane.dht import Record
 from appliance.skills.catalogue import load_catalogue
 from appliance.tasks import machine
 from appliance.tasks import manager as module
+from appliance.tasks.executor import Telling
 from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.plans import Plans
@@ -354,6 +356,30 @@ async def test_forged_run_events_are_counted_and_dropped(manager: TaskManager, p
     plane.session.publish(keyspace.RUN_EVENT, replace(event, gateway="gw-1"), "t-2", "s1")
     plane.session.put(plane.keys(keyspace.RUN_EVENT, "t-2", "s1"), b"{")
     assert plane.session.refused == {"forged run event": 2}
+
+
+async def test_own_runs_are_heard_without_the_network(plane: Any, tasks_config: Any, catalogue: Any) -> None:
+    """The executor here hands its events to the coordinator; what comes over the network in this name is not heard."""
+    plane.rpc.on["run"] = never
+    telling = Telling(plane)
+    manager = TaskManager(
+        tasks_config, plane=plane, catalogue=catalogue, decomposer=cast("Any", AgreeableDecomposer()), site=Site(),
+        runs=telling,
+    )  # fmt: skip
+    plane.registry.gateways = {"gw-1": GatewayStatus(id="gw-1", fleet="f", capacity=1)}
+    await manager.start()
+    await manager.submit(wish(plane))
+    coordinator = manager.coordinator("t-1")
+    assert coordinator is not None
+    await until(lambda: [each.state for each in coordinator.record.subtasks] == [SubtaskState.DISPATCHED])
+    event = RunEvent(task="t-1", subtask="s1", attempt=1, kind=RunEventKind.STARTED, gateway="gw-1")
+    plane.session.publish(keyspace.RUN_EVENT, replace(event, kind=RunEventKind.SUCCEEDED), "t-1", "s1")
+    telling.tell(event)
+    telling.tell(replace(event, task="t-other"))
+    await until(lambda: coordinator.record.subtasks[0].state is not SubtaskState.DISPATCHED)
+    assert coordinator.record.subtasks[0].state is SubtaskState.RUNNING
+    assert plane.session.refused == {}
+    await manager.stop()
 
 
 async def test_hostile_requests_are_refused_with_a_reason(manager: TaskManager, plane: Any) -> None:
