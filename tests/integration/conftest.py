@@ -7,8 +7,11 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
+from fleets import fleet_in
 from pool_bench import HANDLER, Bench, write_probe
 
+from appliance.client import FleetClient
+from appliance.connection import FleetState
 from appliance.errors import PrerequisiteError
 from appliance.pool import images
 from appliance.pool.engine import remove_fleet, socket_path
@@ -73,3 +76,17 @@ async def bench(built: None, folder: Path, catalogue: Catalogue) -> AsyncIterato
     for pool in it.pools:
         await pool.stop(keep_containers=False)
     await remove_fleet(it.fleet, volumes=True)
+
+
+@pytest.fixture
+async def fleet(tmp_path: Path, request: pytest.FixtureRequest) -> AsyncIterator[FleetState]:
+    """Run the fleet that the module's `FLEET` describes, each gateway, robot and recorder a process of its own."""
+    async with fleet_in(tmp_path, **request.module.FLEET) as state:
+        yield state
+
+
+@pytest.fixture
+async def client(fleet: FleetState) -> AsyncIterator[FleetClient]:
+    """Return an operator on that fleet."""
+    async with FleetClient(fleet.endpoint, operator="ann") as made:
+        yield made

@@ -10,31 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fleets import fleet_in
+from fleets import alerts_until, kill, swiftbot
 from terminal import Terminal
 
 from appliance.client import FleetClient
 from appliance.connection import FleetState
 from appliance.errors import NotFoundError
 from appliance.model import Approval, TaskRequest
-from appliance.model.alerts import Alert
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
+FLEET = {"gateways": 3, "zenoh": 2}
 LONG_S = 60.0
-
-
-@pytest.fixture
-async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
-    """Three gateways, a recorder and two rovers as processes."""
-    async with fleet_in(tmp_path, gateways=3, zenoh=2) as state:
-        yield state
-
-
-@pytest.fixture
-async def client(fleet: FleetState) -> AsyncIterator[FleetClient]:
-    """Return an operator on it."""
-    async with FleetClient(fleet.endpoint, operator="ann") as made:
-        yield made
 
 
 @pytest.fixture
@@ -45,50 +31,18 @@ async def terminal(tmp_path: Path) -> AsyncIterator[Terminal]:
     await made.close()
 
 
-def kill(fleet: FleetState, name: str) -> None:
-    """End a process of a fleet at once."""
-    os.kill(next(each.pid for each in fleet.processes if each.name == name), signal.SIGKILL)
-
-
-async def swiftbot(fleet: FleetState, *words: str) -> tuple[int, str, str]:
-    """Run the real command; returns exit code, output, errors."""
-    where = ["--fleet", fleet.fleet, *(word for each in fleet.endpoints for word in ("--connect", each))]
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", *words, *where,
-        stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-        env=os.environ | {"SWIFTBOT_OPERATOR": "cora"},
-    )  # fmt: skip
-    out, err = await process.communicate()
-    assert process.returncode is not None
-    return process.returncode, out.decode(), err.decode()
-
-
-async def until(client: FleetClient, holds: Callable[[dict[str, Alert]], bool]) -> dict[str, Alert]:
-    """Wait until the alerts are so; returns them by id."""
-    found: dict[str, Alert] = {}
-    try:
-        async with asyncio.timeout(LONG_S):
-            while True:
-                found = {each.id: each for each in (await client.alerts()).alerts}
-                if holds(found):
-                    return found
-                await asyncio.sleep(0.2)
-    except TimeoutError:
-        pytest.fail(f"the alerts are {sorted(found)}")
-
-
 async def test_each_fault_has_its_alert_until_it_is_over(fleet: FleetState, client: FleetClient) -> None:
     """A dead robot, gateway and recorder, a failed task and a plan that waits; acknowledged, retried, rejected."""
     await client.submit(TaskRequest(instruction="rover_1: go to dock 3", id="t-late", deadline_s=1.0))
     await client.submit(TaskRequest(instruction="rover_1: go to dock 1", id="t-held", approval=Approval.ALWAYS))
     wanted = {"task-failed.t-late", "plan-waits.t-held"}
-    found = await until(client, lambda found: wanted <= set(found))
+    found = await alerts_until(client, lambda found: wanted <= set(found))
     assert found["plan-waits.t-held"].until_ns > found["plan-waits.t-held"].since_ns
     kill(fleet, "rover_2")
     kill(fleet, "gw-2")
     kill(fleet, "recorder")
     wanted |= {"robot-offline.rover_2", "gateway-lost.gw-2", "recorder.recorder"}
-    found = await until(client, lambda found: wanted <= set(found))
+    found = await alerts_until(client, lambda found: wanted <= set(found))
 
     # Every gateway tells the same, and the command line what it hides otherwise.
     code, out, _ = await swiftbot(fleet, "alerts", "--json")
@@ -108,7 +62,7 @@ async def test_each_fault_has_its_alert_until_it_is_over(fleet: FleetState, clie
     assert code == 1
     assert "no-such is over" in out
     await client.acknowledge(["robot-offline.rover_2"], why="later")
-    found = await until(client, lambda found: found["robot-offline.rover_2"].acked is not None)
+    found = await alerts_until(client, lambda found: found["robot-offline.rover_2"].acked is not None)
     word = found["robot-offline.rover_2"].acked
     assert word is not None
     assert (word.by, word.why) == ("cora", "being mended")
@@ -120,7 +74,9 @@ async def test_each_fault_has_its_alert_until_it_is_over(fleet: FleetState, clie
     # What is mended is over: a plan that was rejected. A gateway that is lost stays so, with who has taken note of it.
     await client.reject("t-held", plan_hash=(await client.task("t-held")).proposal.hash)  # pyright: ignore[reportOptionalMemberAccess]
     await client.acknowledge(["gateway-lost.gw-2"])
-    await until(client, lambda found: "plan-waits.t-held" not in found and found["gateway-lost.gw-2"].acked is not None)
+    await alerts_until(
+        client, lambda found: "plan-waits.t-held" not in found and found["gateway-lost.gw-2"].acked is not None
+    )
     code, _, _ = await swiftbot(fleet, "fleet")
     assert code == 1
 

@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from fleets import fleet_in
+from fleets import command, fleet_in, where
 from terminal import Terminal
 
 from appliance.client import FleetClient
@@ -29,28 +29,12 @@ async def fleet(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Fleet
         yield state
 
 
-@pytest.fixture
-async def client(fleet: FleetState) -> AsyncIterator[FleetClient]:
-    """Return an operator on it."""
-    async with FleetClient(fleet.endpoint, operator="ann") as made:
-        yield made
-
-
-def where(fleet: FleetState) -> list[str]:
-    """Return the options that name a fleet."""
-    return ["--fleet", fleet.fleet, *(word for each in fleet.endpoints for word in ("--connect", each))]
-
-
 async def swiftbot(fleet: FleetState, *words: str, code: int = 0) -> str:
     """Run the real command, which ends with an exit code; returns its output."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", *words, *where(fleet),
-        stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-    )  # fmt: skip
-    out, err = await process.communicate()
-    assert process.returncode == code, (words, out.decode(), err.decode())
-    assert b"Traceback" not in err
-    return out.decode()
+    ended_with, out, err = await command(*words, *where(fleet), by="")
+    assert ended_with == code, (words, out, err)
+    assert "Traceback" not in err
+    return out
 
 
 async def ended(client: FleetClient, task: str) -> TaskState:

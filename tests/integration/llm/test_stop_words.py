@@ -5,12 +5,9 @@ import contextlib
 import os
 import pty
 import sys
-from collections.abc import AsyncIterator
-from pathlib import Path
 
 import msgspec
 import pytest
-from fleets import fleet_in
 
 from appliance.client import FleetClient
 from appliance.connection import FleetState
@@ -18,15 +15,9 @@ from appliance.errors import Exit, RefusedError
 from appliance.model import TaskRecord, TaskRequest, TaskState
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
+FLEET = {"gateways": 2, "zenoh": 1}
 
 FAR = "Rover_1: go to dock 3, then go to dock 2, then go to dock 1, then go to dock 3"
-
-
-@pytest.fixture
-async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
-    """Two gateways and a rover."""
-    async with fleet_in(tmp_path, gateways=2, zenoh=1) as state:
-        yield state
 
 
 async def begun(fleet: FleetState, *words: str) -> asyncio.subprocess.Process:

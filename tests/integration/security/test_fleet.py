@@ -2,13 +2,12 @@
 
 import asyncio
 import json
-import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fleets import fleet_in
+from fleets import command, fleet_in, swiftbot
 from msgspec.structs import replace
 
 from appliance.client import FleetClient
@@ -31,23 +30,6 @@ async def fleet(anyio_backend: str, tmp_path: Path) -> AsyncIterator[FleetState]
         yield state
 
 
-async def swiftbot(fleet: FleetState, *words: str, keys: Path | None = None) -> tuple[int, str, str]:
-    """Run a command on a fleet; returns exit code, output and problems."""
-    more = ("--keys", str(keys)) if keys is not None else ()
-    return await swiftbot_alone(*words, "--dir", fleet.directory, "--fleet", fleet.fleet, *more)
-
-
-async def swiftbot_alone(*words: str) -> tuple[int, str, str]:
-    """Run a command that asks no fleet."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", *words,
-        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-    )  # fmt: skip
-    out, problems = await process.communicate()
-    assert process.returncode is not None
-    return process.returncode, out.decode(), problems.decode()
-
-
 async def test_a_task_is_done_in_the_name_of_a_certificate(fleet: FleetState) -> None:
     """Submitted, planned, coordinated, run, flown and recorded over links with keys; by the name that the keys have."""
     async with FleetClient(fleet.endpoint, operator="ceo") as client:
@@ -61,7 +43,7 @@ async def test_a_task_is_done_in_the_name_of_a_certificate(fleet: FleetState) ->
         for status in client.plane.registry.gateways.values():
             assert not [kind for kind in status.refused if "unauthorized" in kind or "token without" in kind]
     logged = [path for path in Path(fleet.record_dir).iterdir() if path.suffix == ".mcap"]
-    code, out, problems = await swiftbot_alone("log", "info", *map(str, logged), "--json")
+    code, out, problems = await command("log", "info", *map(str, logged), "--json")
     assert code == 0, problems
     assert "task/" in out
 
@@ -72,17 +54,17 @@ async def test_each_role_does_by_the_command_line_what_it_may(fleet: FleetState)
     authority = Authority.load(keys_folder(Path(fleet.directory)))
     viewer = authority.folder / "viewer-vera.pem"
     authority.issue(Role.VIEWER, "vera", out=viewer)
-    code, out, problems = await swiftbot(fleet, "fleet", "--json", keys=viewer)
+    code, out, problems = await swiftbot(fleet, "fleet", "--json", "--keys", str(viewer))
     assert code == 0, problems
     shown: Any = json.loads(out)
     assert "gw-1" in json.dumps(shown)
     for words in (("submit", "drone_1 land", "--yes"), ("drain", "gw-1"), ("resume",)):
-        code, out, problems = await swiftbot(fleet, *words, keys=viewer)
+        code, out, problems = await swiftbot(fleet, *words, "--keys", str(viewer))
         assert code == 9, out + problems
         assert "viewer vera may not ask" in problems
-    code, _, problems = await swiftbot(fleet, "stop", keys=viewer)
+    code, _, problems = await swiftbot(fleet, "stop", "--keys", str(viewer))
     assert code in (0, 1), problems
-    code, out, _ = await swiftbot(fleet, "stops", "--json", keys=viewer)
+    code, out, _ = await swiftbot(fleet, "stops", "--json", "--keys", str(viewer))
     assert '"vera"' in out
     endpoint = fleet.endpoints[0].replace("tls/", "tcp/")
     code, _, problems = await swiftbot(fleet, "fleet", "--connect", endpoint)

@@ -2,33 +2,17 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
-from pathlib import Path
 
 import pytest
-from fleets import fleet_in
+from fleets import alerts_until, kill, swiftbot
 
 from appliance.client import FleetClient
 from appliance.connection import FleetState
 from appliance.model import Approval, TaskRequest, TaskState
-from tests.integration.cli.test_alerts import kill, swiftbot, until
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
+FLEET = {"gateways": 2, "zenoh": 2}
 LONG_S = 60.0
-
-
-@pytest.fixture
-async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
-    """Two gateways and two rovers as processes."""
-    async with fleet_in(tmp_path, gateways=2, zenoh=2) as state:
-        yield state
-
-
-@pytest.fixture
-async def client(fleet: FleetState) -> AsyncIterator[FleetClient]:
-    """Return an operator on it."""
-    async with FleetClient(fleet.endpoint, operator="ann") as made:
-        yield made
 
 
 @pytest.mark.long
@@ -69,10 +53,10 @@ async def test_a_robot_in_maintenance_is_left_alone(fleet: FleetState, client: F
     assert "in maintenance by cora: tyres" in " ".join(err.split())
     kill(fleet, "rover_1")
     kill(fleet, "rover_2")
-    await until(client, lambda found: "robot-offline.rover_2" in found)
+    await alerts_until(client, lambda found: "robot-offline.rover_2" in found)
     assert "robot-offline.rover_1" not in {each.id for each in (await client.alerts()).alerts}
     code, out, _ = await swiftbot(fleet, "robots", "list", "--json")
     assert {each["id"]: bool(each["maintenance"]) for each in json.loads(out)} == {"rover_1": True, "rover_2": False}
     code, _, _ = await swiftbot(fleet, "robots", "maintain", "rover_1", "--end")
     assert code == 0
-    await until(client, lambda found: "robot-offline.rover_1" in found)
+    await alerts_until(client, lambda found: "robot-offline.rover_1" in found)

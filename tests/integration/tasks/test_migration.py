@@ -4,16 +4,15 @@ import asyncio
 import json
 import os
 import signal
-import sys
 from collections import Counter
 from pathlib import Path
 
 import msgspec
 import pytest
+from fleets import swiftbot
 from moving_bench import counting, ended, fleet_of, further_gateway, pretty, until_running
 
 from appliance.client import FleetClient
-from appliance.connection import FleetState
 from appliance.errors import NotFoundError, RefusedError
 from appliance.model import Plan, RobotCommand, Subtask, TaskRequest, TaskState
 from appliance.model.task_api import MigrateAsk, MigrationRequest
@@ -24,18 +23,6 @@ from appliance.tasks.settings import MigrationConfig
 from workshop import local_fleet
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
-
-
-async def swiftbot(state: FleetState, *arguments: str) -> tuple[int, str, str]:
-    """Run a command of the command line; its exit code and what it said."""
-    command = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "appliance.cli", *arguments, "--fleet", state.fleet, "--dir", state.directory,
-        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-    )  # fmt: skip
-    async with asyncio.timeout(120):
-        out, err = await command.communicate()
-    assert command.returncode is not None
-    return command.returncode, out.decode(), err.decode()
 
 
 @pytest.mark.long

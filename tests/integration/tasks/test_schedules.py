@@ -2,35 +2,19 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Any
 
 import pytest
-from fleets import fleet_in
+from fleets import alerts_until, kill, swiftbot
 
 from appliance.client import FleetClient
 from appliance.connection import FleetState
 from appliance.model import TaskState
 from appliance.model.task_api import TasksAsk
-from tests.integration.cli.test_alerts import kill, swiftbot, until
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
+FLEET = {"gateways": 3, "zenoh": 2}
 LONG_S = 90.0
-
-
-@pytest.fixture
-async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
-    """Three gateways and two rovers as processes."""
-    async with fleet_in(tmp_path, gateways=3, zenoh=2) as state:
-        yield state
-
-
-@pytest.fixture
-async def client(fleet: FleetState) -> AsyncIterator[FleetClient]:
-    """Return an operator on it."""
-    async with FleetClient(fleet.endpoint, operator="ann") as made:
-        yield made
 
 
 async def ended(client: FleetClient, text: str, count: int) -> list[Any]:
@@ -104,13 +88,15 @@ async def test_what_waits_or_was_missed_is_an_alert(fleet: FleetState, client: F
     code, _, _ = await swiftbot(fleet, "schedule", "add", "rover_1: go to dock 2", "--every", "10s", "--name", "held",
                                 "--approval", "always")  # fmt: skip
     assert code == 0
-    found = await until(client, lambda found: any(name.startswith("plan-waits.held.") for name in found))
-    found = await until(client, lambda found: "schedule-missed.held" in found)
+    found = await alerts_until(client, lambda found: any(name.startswith("plan-waits.held.") for name in found))
+    found = await alerts_until(client, lambda found: "schedule-missed.held" in found)
     assert "had not ended" in found["schedule-missed.held"].what
     code, _, _ = await swiftbot(fleet, "alerts", "ack", "schedule-missed.held", "--why", "seen")
     assert code == 0
     # Missed again, it waits for an acknowledgement again.
-    await until(client, lambda found: "schedule-missed.held" in found and found["schedule-missed.held"].acked is None)
+    await alerts_until(
+        client, lambda found: "schedule-missed.held" in found and found["schedule-missed.held"].acked is None
+    )
     code, _, _ = await swiftbot(fleet, "schedule", "remove", "held")
     assert code == 0
 

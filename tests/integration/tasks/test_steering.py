@@ -4,12 +4,11 @@ import asyncio
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 import pytest
-from fleets import fleet_in
 from msgspec.structs import replace
 
 from appliance.client import FleetClient
@@ -31,16 +30,10 @@ from appliance.record.reader import read
 from appliance.tasks.replay import replay
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
+FLEET = {"zenoh": 1, "sim_rate": 2.0}
 
 TOUR = "Rover_1: go to dock 3, then go to dock 2, then go to dock 1"
 LONG = f"{TOUR}, then go to dock 3, then go to dock 2, then go to dock 1, then go to dock 3"
-
-
-@pytest.fixture
-async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
-    """Three gateways, a recorder and a rover as processes; ended and cleaned up afterwards."""
-    async with fleet_in(tmp_path, sim_rate=2.0, zenoh=1) as state:
-        yield state
 
 
 async def until(client: FleetClient, task: str, holds: Callable[[TaskRecord], bool], limit_s: float = 60) -> TaskRecord:

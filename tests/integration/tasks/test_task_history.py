@@ -3,25 +3,17 @@
 import csv
 import io
 import json
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from fleets import fleet_in
+from fleets import swiftbot
 
 from appliance.client import FleetClient
 from appliance.connection import FleetState
 from appliance.model import TaskRequest
-from tests.integration.cli.test_alerts import swiftbot
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
-
-
-@pytest.fixture
-async def fleet(tmp_path: Path) -> AsyncIterator[FleetState]:
-    """Two gateways and a rover as processes."""
-    async with fleet_in(tmp_path, gateways=2, zenoh=1) as state:
-        yield state
+FLEET = {"gateways": 2, "zenoh": 1}
 
 
 async def test_tasks_are_found_paged_exported_and_duplicated(fleet: FleetState, tmp_path: Path) -> None:
