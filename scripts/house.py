@@ -48,8 +48,10 @@ def code_lines(source: str) -> int:
     return len(lines - without)
 
 
-def imports(tree: ast.Module, module: str, is_package: bool) -> set[str]:
+@cache
+def imports(path: Path, module: str) -> set[str]:
     """List the names that a module imports when it is loaded."""
+    is_package = path.name == "__init__.py"
     found: set[str] = set()
     package = module if is_package else module.rpartition(".")[0]
 
@@ -70,7 +72,7 @@ def imports(tree: ast.Module, module: str, is_package: bool) -> set[str]:
             elif isinstance(node, ast.Try):
                 visit(node.body)
 
-    visit(tree.body)
+    visit(ast.parse(path.read_text()).body)
     return found
 
 
@@ -88,7 +90,7 @@ def longest_chain(modules: dict[str, Path], inside: str) -> list[str]:
     chosen = {name: path for name, path in modules.items() if name == inside or name.startswith(f"{inside}.")}
     arrows: dict[str, set[str]] = defaultdict(set)
     for name, path in chosen.items():
-        for target in imports(ast.parse(path.read_text()), name, path.name == "__init__.py"):
+        for target in imports(path, name):
             if target in chosen and target != name and not name.startswith(f"{target}."):
                 arrows[name].add(target)
 

@@ -23,7 +23,7 @@ from appliance.ports import free_port as ask_port
 
 # Found examples are printed, not kept: no run depends on an earlier one, and the tree may be read-only.
 # No deadlines: how long an example takes says how busy the machine is.
-settings.register_profile("alone", database=None, deadline=None)
+settings.register_profile("alone", database=None, deadline=None, max_examples=50)
 settings.load_profile("alone")
 if sys.pycache_prefix:
     # What hypothesis reads out of the sources (their constants) is kept where their bytecode is: a second a process.
@@ -121,12 +121,6 @@ def free_port() -> int:
 def free_udp_port() -> int:
     """Return a loopback UDP port that is free just now."""
     return ask_port(socket.SOCK_DGRAM)
-
-
-@pytest.fixture(scope="session")
-def quick() -> bool:
-    """Return whether quick feedback is wanted: what goes through a large corpus takes a sample of it then."""
-    return QUICK
 
 
 @pytest.fixture(scope="session")

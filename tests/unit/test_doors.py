@@ -23,12 +23,13 @@ def doors(room: str) -> set[str]:
 def imports() -> tuple[tuple[Path, str, str], ...]:
     """Return who imports what of the product: file, module, name."""
     files = [path for folder in ("appliance", "workshop", "scripts") for path in sorted((ROOT / folder).rglob("*.py"))]
+    imported = re.compile(r"^\s*from (appliance\.\S+) import (\([^)]*\)|.*)$", re.MULTILINE)
     return tuple(
-        (path, node.module or "", name.name)
+        (path, module, name.split(" as ")[0].strip())
         for path in files
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ImportFrom)
-        for name in node.names
+        for module, names in imported.findall(path.read_text())
+        for name in re.sub("#.*", "", names).strip("()").split(",")
+        if name.strip()
     )
 
 

@@ -371,14 +371,9 @@ def test_models_are_kept_by_age_and_mark() -> None:
     assert [model.number for model in rounds.kept_models(models, 3)] == [2, 5, 6, 7]
 
 
-@pytest.mark.parametrize(
-    ("count", "takeovers"),
-    [
-        pytest.param(300, 15, marks=pytest.mark.thorough),
-        pytest.param(1000, 50, marks=[pytest.mark.long, pytest.mark.timeout(900)]),
-    ],
-)
-def test_ten_thousand_clients_many_rounds(count: int, takeovers: int) -> None:
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_ten_thousand_clients_many_rounds() -> None:
     """100 of 10,000 are chosen a round, some of everything goes wrong: the invariants hold, and nobody is left out."""
     slow = {
         f"part-{n:05d}": Device(5.0 if n % 8 == 0 else 3.0 if n % 8 == 1 else 1.0 + n % 100 / 500)
@@ -387,15 +382,15 @@ def test_ten_thousand_clients_many_rounds(count: int, takeovers: int) -> None:
     made = Recipe(
         model="clips",
         clients=Clients(partitions=1000, per_round=100),
-        rounds=Rounds(count=count, mode=Mode.PARTIAL, timeout_s=50.0),
+        rounds=Rounds(count=1000, mode=Mode.PARTIAL, timeout_s=50.0),
     )
     wrong = Faults(
         fails=0.02, silent=0.002, leaves=0.02, repeated=0.02, foreign=0.01, takeover=0.0005, refused=0.001,
         aggregation=0.01,
     )  # fmt: skip
     outcome = Simulation(made, slow, faults=wrong, seed_number=1).play()
-    assert outcome.run.round == count
-    assert outcome.takeovers > takeovers
+    assert outcome.run.round == 1000
+    assert outcome.takeovers > 50
     assert len(outcome.counted) == 10_000
 
 

@@ -193,7 +193,7 @@ def _storm(chance: random.Random, count: int) -> list[tuple[bytes, tuple[str, in
     return found
 
 
-@pytest.mark.thorough
+@pytest.mark.long
 async def test_a_flood_of_everything_costs_no_memory() -> None:
     """Frames that make a gateway remember something, from ever other senders: what is kept does not grow with them."""
     async with station(free_port(socket.SOCK_DGRAM), sender_hz=0.0, repeat_s=0.01, max_vehicles=8) as (made, refused):

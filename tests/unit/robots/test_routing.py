@@ -2,11 +2,23 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import Struct
 
-from appliance.robots.mavlink.routing import End, Passage, RoutingTable, Rules
+from appliance.robots.mavlink.routing import BROADCAST, End, RoutingTable, Rules
 
 GCS, DRONE, CAMERA = End(0, ("gcs", 1)), End(1, ("drone", 1)), End(2, ("camera", 1))
 OWN = 245
+
+
+class Passage(Struct, frozen=True, kw_only=True):
+    """A frame as routing sees it. Targets are 0 where a message has none, or means all."""
+
+    system: int
+    component: int
+    name: str
+    raw: bytes
+    target_system: int = BROADCAST
+    target_component: int = BROADCAST
 
 
 def passage(system: int, component: int = 1, *, to: int = 0, part: int = 0, name: str = "COMMAND_LONG") -> Passage:

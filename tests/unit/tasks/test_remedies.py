@@ -1,6 +1,7 @@
 """No task ends as failed without a next step, whatever failed and wherever it failed."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,10 @@ MAKERS = ("Failure", "RobotFailure", "CallError", "_error", "failed")
 
 def calls(*names: str) -> Iterator[tuple[Path, ast.Call]]:
     """Return each call of these names in the product, with its file."""
-    for file in sorted(ROOT.rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    called = re.compile(rf"\b(?:{'|'.join(names)})\(")
+    texts = {file: file.read_text(encoding="utf-8") for file in sorted(ROOT.rglob("*.py"))}
+    for file, text in texts.items():
+        for node in ast.walk(ast.parse(text)) if called.search(text) else ():
             if isinstance(node, ast.Call):
                 name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
                 if name in names:

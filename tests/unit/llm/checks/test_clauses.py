@@ -78,9 +78,9 @@ def test_there_are_wrappers_of_many_kinds() -> None:
     assert len({kind for kind, _ in found}) >= 10
 
 
-@pytest.mark.parametrize("shift", [0, pytest.param(1, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("shift", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_what_surrounds_an_order_is_accounted_for_or_holds(shift: int) -> None:
-    """Each wrapper around some order (thorough: around all): only courtesies run."""
+    """Each wrapper around some order (the long one: around all): only courtesies run."""
     ran: list[str] = []
     held: list[str] = []
     for number, (kind, wrapper) in enumerate(wrappers()):

@@ -6,12 +6,12 @@ from appliance.skills.catalogue import load_catalogue
 from workshop.corpus import load
 from workshop.train.examples import Example, example_of
 
-SAMPLE = 16
-"""Where quick feedback is wanted, every so many pairs of the corpus: all of them take long to read."""
+STEP = 16
+"""Every so many pairs of the corpus: all of them take long to read, and a test draws some hundreds."""
 
 
 @pytest.fixture(scope="session")
-def examples(quick: bool) -> list[Example]:
-    """The examples of the corpus."""
+def examples() -> list[Example]:
+    """Examples of the corpus."""
     catalogue = load_catalogue()
-    return [example_of(pair, catalogue) for pair in list(load().values())[:: SAMPLE if quick else 1]]
+    return [example_of(pair, catalogue) for pair in list(load().values())[::STEP]]

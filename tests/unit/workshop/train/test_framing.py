@@ -52,7 +52,7 @@ FETCH = example(
 )
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=100)
 @given(data=st.data(), seed=st.integers(0, 2**32))
 def test_whatever_is_put_otherwise_is_exact(
     examples: list[Example], lexicon: Lexicon, data: st.DataObject, seed: int
@@ -69,7 +69,7 @@ def test_whatever_is_put_otherwise_is_exact(
     assert len(plan(several)) % max(1, len(plan(start))) == 0
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=100)
 @given(data=st.data(), seed=st.integers(0, 2**32))
 def test_whoever_is_told_does_all_of_it(
     examples: list[Example], lexicon: Lexicon, data: st.DataObject, seed: int

@@ -60,7 +60,7 @@ def all_of(one: Example, two: Example) -> list[Example]:
     return made
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=100)
 @given(data=st.data(), seed=st.integers(0, 2**32))
 def test_two_are_exact(examples: list[Example], data: st.DataObject, seed: int) -> None:
     """The symbols of two as one are a plan over the words, with the subtasks of both."""

@@ -31,7 +31,7 @@ def plan(of: Example) -> tuple[Subtask, ...]:
     return read(of.symbols, words_of(" ".join(of.words), ()), CATALOGUE).subtasks
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=100)
 @given(data=st.data(), seed=st.integers(0, 2**32))
 def test_a_list_is_exact(examples: list[Example], data: st.DataObject, seed: int) -> None:
     """The symbols are a plan over the words: copies of one subtask, in turn."""
