@@ -167,11 +167,6 @@ class View:
         near = self._within() + len(self._names) - self._from()
         return 1.0 + (near * (RING_SIZE / stretch) if stretch else len(self._names))
 
-    def replica_range(self) -> int | None:
-        """The position after which this gateway holds copies, as owner or replica; None: of all keys, or unknown."""
-        before = self.before()
-        return point(before[-self.replicas]) if len(before) >= self.replicas else None
-
     def step(self, target: int, *, named: bool = False) -> Step:
         """What `me` can say of a position: that it is its own, whose it is, or who is closer to it.
 

@@ -132,11 +132,6 @@ class Merge:
         self._offsets[gateway] = ours_ns - theirs_ns
 
     @property
-    def clocks(self) -> frozenset[str]:
-        """The gateways whose clocks are known."""
-        return frozenset(self._offsets)
-
-    @property
     def dropped(self) -> Mapping[str, int]:
         """Lines dropped since they were last told, by gateway; those of no one in particular under ""."""
         return self._dropped

@@ -244,10 +244,6 @@ class Draft(Struct, frozen=True, kw_only=True):
             return self
         return replace(self, subtasks=self.before[-1], before=self.before[:-1])
 
-    def reset(self) -> "Draft":
-        """Go back to what was proposed; undo brings the edits back."""
-        return self._to(self.proposed.subtasks)
-
     def _put(self, changed: Subtask) -> "Draft":
         return self._to(tuple(changed if each.id == changed.id else each for each in self.subtasks))
 

@@ -11,7 +11,6 @@ from appliance.model import Finding, Severity, Subtask
 
 _ELLIPSIS = frozenset(("does", "do", "same", "likewise", "too"))
 """Words that give another robot what was said before: "rover_1 goes to dock 3 while rover_2 does"."""
-_INSTRUMENT = frozenset(("with", "using", "by", "via", "have", "let", "send", "get", "tell", "ask", "make"))
 
 
 def candidates(facts: Facts, name: str) -> list[str]:

@@ -612,7 +612,6 @@ def _deliver(objects: str, source: str | None, to: str, scope: Scope, *, held: b
 
 
 _CARRY = "bring take carry deliver transport haul transfer move fetch get return"
-_MOVE = "bring carry deliver transport haul transfer move get fetch"
 HANDLING.on(
     _CARRY,
     rf" (?P<o>.+?) {_FROM} (?P<a>.+?)(?:,? and (?:bring|take|carry|deliver) (?:it|them))? (?:over |back )?to (?P<b>.+)",

@@ -141,13 +141,6 @@ class Stops:
         names = tuple(robots)
         return tuple(each.id for each in self.active if not names or any(self.holds(each, robot) for robot in names))
 
-    def covers(self, robots: Iterable[str]) -> bool:
-        """Whether all of these are stopped already; none named: whether a stop of the whole fleet is untouched."""
-        names = tuple(robots)
-        if names:
-            return all(self.of(each) is not None for each in names)
-        return self.whole is not None
-
     def forget(self, most: int = MOST) -> None:
         """Forget the oldest of what has no effect any more, until `most` stops and `MOST` liftings are left."""
         done = [each.id for each in self._stops.values() if not self._in_force(each)]

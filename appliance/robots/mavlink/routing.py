@@ -86,17 +86,6 @@ class Routed(Protocol):
         ...
 
 
-class Passage(Struct, frozen=True, kw_only=True):
-    """A frame as routing sees it. Targets are 0 where a message has none, or means all."""
-
-    system: int
-    component: int
-    name: str
-    raw: bytes
-    target_system: int = BROADCAST
-    target_component: int = BROADCAST
-
-
 class RoutingTable:
     """Routes of one gateway, learned from what is heard.
 

@@ -587,11 +587,6 @@ class Vehicle:
         return self.armed and self.relative_m > 0.7
 
     @property
-    def home_altitude_m(self) -> float:
-        """Altitude of home above mean sea level, by what the vehicle says of both heights."""
-        return self.altitude_m - self.relative_m
-
-    @property
     def pose(self) -> Pose | None:
         """Position in site metres, None before the first fix."""
         if not self.fixed:
