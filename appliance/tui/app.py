@@ -472,8 +472,10 @@ class SwiftbotApp(App[None], inherit_bindings=False):
         self.switch_mode(name)
 
     def do_alerts(self, _given: Mapping[str, str]) -> None:
-        """Show the alerts, over whatever is seen."""
-        if not isinstance(self.screen, AlertsScreen):
+        """Show the alerts, over whatever is seen; where they are shown already, go to the most urgent."""
+        if isinstance(self.screen, AlertsScreen):
+            self.screen.go_to_first()
+        else:
             self.push_screen(AlertsScreen())
 
     def do_schedules(self, _given: Mapping[str, str]) -> None:
@@ -491,6 +493,8 @@ class SwiftbotApp(App[None], inherit_bindings=False):
         elif (found := screen_of(alert)) is not None:
             self.push_screen(found)
         else:
+            if isinstance(self.screen, AlertsScreen):
+                self.pop_screen()  # else it waits there, on this alert, until somebody comes back to that screen
             self.run_line("fleet")
 
     def do_here(self, name: str, given: Mapping[str, str]) -> None:

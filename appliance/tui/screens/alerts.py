@@ -104,6 +104,10 @@ class AlertsScreen(FleetScreen):
             alert: Alert | None = self.query_one("#alerts", Grid).thing
             self.say("#about", Text() if alert is None else about(alert))
 
+    def go_to_first(self) -> None:
+        """Put the cursor on the most urgent."""
+        self.query_one("#alerts", Grid).action_edge(0)
+
     @on(Grid.Picked)
     def drill(self, event: Grid.Picked) -> None:
         """Show what it is about."""

@@ -93,6 +93,26 @@ async def test_two_keys_lead_to_what_an_alert_is_about(view: "FakeView", one: Al
         assert not isinstance(app.screen, AlertsScreen)
 
 
+async def test_the_same_two_keys_lead_to_the_next_alert(view: "FakeView") -> None:
+    """Whatever was looked at before: a recorder leaves no list behind, and in an open list `!` is the most urgent."""
+    view.store.take_alerts((RECORDER,))
+    app = SwiftbotApp(view)
+    async with app.run_test(size=SIZE) as pilot:
+        await pilot.press("7", "exclamation_mark", "enter")
+        await settle(app, pilot)
+        assert app.current_mode == "fleet"
+        await pilot.press("7")
+        await settle(app, pilot)
+        assert not isinstance(app.screen, AlertsScreen)
+        await pilot.press("exclamation_mark")
+        await settle(app, pilot)
+        view.store.take_alert(ROBOT)  # above the one that the cursor is on
+        await settle(app, pilot)
+        await pilot.press("exclamation_mark", "enter")
+        await settle(app, pilot)
+        assert isinstance(app.screen, RobotScreen)
+
+
 async def test_alerts_are_acknowledged_by_key(view: "FakeView") -> None:
     """`a` the selected one, only while unlocked; `A` all, after a question, with the reason."""
     view.store.take_alerts((ROBOT, PLAN))
