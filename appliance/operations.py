@@ -19,13 +19,15 @@ from typing import Annotated, Any, TypeVar, get_args
 
 from msgspec import Meta, Struct
 from msgspec.structs import replace
-from rich.console import RenderableType
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from appliance.after_stop import Left, Offer, bring_back, lefts, origin_of, put_down, robots_of
 from appliance.client import FleetClient, cancel_outcome, unknown_text
 from appliance.errors import ConfigError, NotFoundError, PayloadError, RefusedError, SwiftbotError
+from appliance.estimate import Estimate
+from appliance.estimate import estimate as estimate_plan
 from appliance.learn import tables
 from appliance.model import Plan, RobotInfo, Site, TaskRecord, TaskRequest
 from appliance.model.alerts import AlertsAcked
@@ -456,6 +458,45 @@ async def duplicate(client: FleetClient, task: TaskId) -> Outcome:
     """Submit a task's instruction once more, as a new task with the same priority, deadline and gateways."""
     record = await client.duplicate(task)
     return Outcome(value=record, text=f"task {record.id} is accepted, a duplicate of {task}")
+
+
+@operation("task estimate", title="Estimate", keys=("v",), screens=("tasks", "task", "review"), long=True, footer=False)
+async def estimate(client: FleetClient, task: TaskId) -> Outcome:
+    """Estimate what a task's plan does by the site's map: ways, times, places passed, limits; nothing is simulated."""
+    record = await client.task(task)
+    proposal = record.proposal
+    plan = proposal.plan if proposal is not None and proposal.waits else record.plan
+    if plan is None:
+        raise RefusedError(f"task {record.id} has no plan yet", remedy="wait until it is planned")
+    found = await estimate_of(client, plan)
+    return Outcome(value=found, text=estimate_text(found))
+
+
+async def estimate_of(client: FleetClient, plan: Plan) -> Estimate:
+    """Return what a plan is expected to do, by the site, the robots as they were heard last, and earlier runs."""
+    rows = (await client.experience(1000)).rows
+    measured = {(each.skill, each.robot): each.expected_s for each in rows if each.expected_s is not None}
+    return estimate_plan(plan, site=await client.site(), robots=client.known_robots(), measured=measured)
+
+
+def estimate_text(found: Estimate) -> RenderableType:
+    """Return an estimate as a table of its steps, with what hinders it and what it does not know."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for title in ("subtask", "skill", "robot", "from", "takes", "way", "speed", "passes"):
+        table.add_column(title, overflow="fold")
+    for each in found.steps:
+        cells = (
+            each.subtask, each.skill, each.robot, f"{each.start_s:.0f} s",
+            "not known" if each.takes_s is None else f"{each.takes_s:.0f} s",
+            f"{each.length_m:.1f} m" if each.way else "",
+            f"{each.speed_mps:g} m/s ({each.limit})" if each.limit else "", ", ".join(each.passes),
+        )  # fmt: skip
+        table.add_row(*(Text(cell) for cell in cells))
+    whole = f"about {found.takes_s:.0f} s"
+    if found.unknown:
+        whole += f", without {', '.join(found.unknown)}, of which no run was measured yet"
+    lines = [Text(whole, "bold"), *(Text(f"✘ {each}", "red") for each in found.problems)]
+    return Group(table, *lines, Text(found.note, "dim"))
 
 
 OPERATIONS.append(

@@ -5,10 +5,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
+from rich.console import Group
 
 from appliance import console
-from appliance.cli.common import HERE, WORK, Json, Where, show
+from appliance.cli.common import HERE, WORK, Json, Where, fields, show
 from appliance.errors import ConfigError, Exit
+from appliance.estimate import Estimate
+from appliance.model.task_api import PlanAnswer
+from appliance.operations import estimate_of, estimate_text
 
 if TYPE_CHECKING:
     from appliance.config import GatewayConfig
@@ -20,6 +24,12 @@ def add_to(app: App) -> None:
     """Add these commands."""
     app.command(plan, group=WORK)
     app.command(skill_stats, group=WORK)
+
+
+class PlanEstimated(PlanAnswer, frozen=True, kw_only=True):
+    """A plan, and what it is expected to do."""
+
+    estimate: Estimate
 
 
 async def plan(
@@ -39,10 +49,15 @@ async def plan(
         str,
         Parameter(help="Site of a batch, with places, objects, fence and limits: name or TOML file."),
     ] = "",
+    dry_run: Annotated[
+        bool, Parameter(help="Also estimate by the site's map what the plan does: ways, times, places passed, limits.")
+    ] = False,
     as_json: Json = False,
     where: Where = HERE,
 ) -> int:
     """Plan an instruction and print the plan with its constraints; runs nothing.
+
+    --dry-run is an estimate, no simulation: ways as the robots will plan them, at a steady speed, without waits.
 
     With --batch and --out each case `{"id", "instruction", "robots"?}` gets a line with plan, tier, confidence,
     latency, `decision` (run, hold, refuse, stop) and the checks that spoke. Ctrl-C keeps what is written, and the same
@@ -65,6 +80,11 @@ async def plan(
             show({"decision": "stop", "robots": stop.robots, **unknown}, as_json=as_json, table=_stop_text(stop))
             return Exit.DONE
         answer = await client.plan(text, private=private)
+        if dry_run:
+            found = await estimate_of(client, answer.plan)
+            both = Group(console.plan_answer(answer), estimate_text(found))
+            show(PlanEstimated(**fields(answer), estimate=found), as_json=as_json, table=both)
+            return Exit.DONE
     show(answer, as_json=as_json, table=console.plan_answer(answer))
     return 0
 

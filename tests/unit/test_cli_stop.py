@@ -31,7 +31,7 @@ from appliance.model import (
     TaskState,
 )
 from appliance.model.robot_api import StopAnswer
-from appliance.model.task_api import PlanAnswer, PlanChecked
+from appliance.model.task_api import ExperienceList, PlanAnswer, PlanChecked
 
 ROSTER = ("rover_1", "rover_2", "drone_1")
 PLAN = Plan(domain="inspection", subtasks=(Subtask(id="s1", skill="goto", robot="rover_1", params={"place": "dock"}),))
@@ -75,6 +75,11 @@ class Fleet:
     def known_robots(self) -> dict[str, RobotInfo]:
         """Return the robots as they are set."""
         return self.known
+
+    async def experience(self, limit: int) -> ExperienceList:
+        """Return that nothing was measured."""
+        assert limit
+        return ExperienceList(gateway="gw-1", rows=())
 
     async def site(self) -> Site:
         """Return a map with one place."""
@@ -274,6 +279,20 @@ def test_what_only_looks_like_a_stop_is_a_task(fleet: Fleet, swiftbot: Any) -> N
     assert code == 0
     assert [each.instruction for each in fleet.submitted] == ["rover_1: stop at dock 1"]
     assert fleet.stops == []
+
+
+def test_a_dry_run_is_an_estimate_and_says_so(fleet: Fleet, swiftbot: Any) -> None:
+    """Way and time by the map, and what hinders the plan; as JSON beside the plan."""
+    fleet.known = {"rover_1": RobotInfo(id="rover_1", kind="zenoh", pose=Pose(x=10.0, y=3.0))}
+    code, out, _ = swiftbot("plan", "rover_1: go to the dock", "--dry-run")
+    assert code == 0
+    assert "s1 goto: the site has no place 'dock'" in out
+    assert "nothing was simulated" in " ".join(out.split())
+    code, out, _ = swiftbot("plan", "rover_1: go to the dock", "--dry-run", "--json")
+    found = msgspec.json.decode(out)
+    assert [each["subtask"] for each in found["estimate"]["steps"]] == ["s1"]
+    assert found["plan"]["subtasks"][0]["skill"] == "goto"
+    assert not fleet.submitted
 
 
 def test_plan_says_that_it_is_a_stop(fleet: Fleet, swiftbot: Any) -> None:

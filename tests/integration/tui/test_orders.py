@@ -105,6 +105,16 @@ async def test_the_order_of_a_plan_is_edited(ann: Operator, client: FleetClient)
     assert [ended.of(name).subtask.robot for name in ("s1", "s2", "s3")] == ["rover_1", "rover_1", "rover_2"]
 
 
+async def test_the_estimate_of_a_plan_that_waits(ann: Operator, client: FleetClient) -> None:
+    """`v` in the review says where the plan goes, how far and how long, and that it is an estimate; nothing moves."""
+    record = await proposed(ann, client)
+    await ann.press("v")
+    await ann.see(":estimate", "goto", "m/s (", "about", "nothing was simulated")
+    assert (await client.task(record.id)).state is TaskState.PROPOSED
+    await ann.press("escape")
+    await client.reject(record.id)
+
+
 @does("reject")
 async def test_reject(ann: Operator, client: FleetClient) -> None:
     """A plan that is turned down does not run, and the record says who did so."""
