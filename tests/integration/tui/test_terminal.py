@@ -53,7 +53,8 @@ async def test_main_path(fleet: FleetState, terminal: Terminal, tmp_path: Path) 
 
     # Submit: names are completed, the plan is shown, and it is edited before it runs.
     await terminal.press("s")
-    await terminal.see("Instruction")
+    # The example in the empty field is of the site's places: from now on Tab completes them.
+    await terminal.see("Instruction", "go to dock 3")
     await terminal.write("rover_1: go to doc")
     await terminal.press("Tab")
     await terminal.see("rover_1: go to dock ")
