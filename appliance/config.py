@@ -13,6 +13,7 @@ import tomli_w
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError, PayloadError
+from appliance.floor.settings import FloorConfig
 from appliance.llm.settings import LlmConfig, SafetyConfig
 from appliance.model.keys import check_name
 from appliance.observe.settings import ObserveConfig
@@ -52,6 +53,7 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     llm: LlmConfig = field(default_factory=LlmConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     robots: RobotsConfig = field(default_factory=RobotsConfig)
+    floor: FloorConfig = field(default_factory=FloorConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
     tasks: TasksConfig = field(default_factory=TasksConfig)
     observe: ObserveConfig = field(default_factory=ObserveConfig)
@@ -107,6 +109,7 @@ def check(config: GatewayConfig, source: str) -> None:
         if config.plane.keys:
             for link in config.robots.mavlink:
                 link.check_keyed()
+        config.floor.check()
         config.record.check()
         config.llm.check()
         config.safety.check()

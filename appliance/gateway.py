@@ -31,6 +31,7 @@ from appliance.closures import keeper as closures
 from appliance.closures.keeper import Closures
 from appliance.config import GatewayConfig
 from appliance.errors import ConfigError, PrerequisiteError
+from appliance.floor.keeper import FloorKeeper
 from appliance.identity.parts import ALL, DEVELOPMENT, InForce, Kind
 from appliance.identity.parts import FILE as PARTS_FILE
 from appliance.learn import records as learn_records
@@ -321,6 +322,7 @@ class Gateway:
             on_wait=telling.waits,
             hindrance=self.authority.hindrance,
             enquiries=enquiries,
+            floor=self.floor,
             orders=orders.held,
         )
         self._storage = storage = StateHere(
@@ -530,6 +532,20 @@ class Gateway:
         rpc.register(keyspace.ROBOT_LINK_ADD, self.hub.add_link)
         rpc.register(keyspace.ROBOT_LINK_REMOVE, self.hub.remove_link)
         rpc.register(keyspace.ROBOT_FORGET, self.hub.forget)
+        self._start_floor(site)
+
+    def _start_floor(self, site: Site) -> None:
+        config = self.config
+        self.floor = FloorKeeper(
+            self.plane,
+            site,
+            config.floor,
+            voters=bool(config.plane.voters),
+            takeoff_m=config.robots.takeoff_altitude_m,
+            hindrance=self.authority.hindrance,
+        )
+        self.floor.start()
+        self._stack.push_async_callback(self.floor.close)
 
     def _out_of_use(self) -> OutOfUse:
         return OutOfUse(places=self.closures.places, robots=self.closures.robots)

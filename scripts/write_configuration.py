@@ -27,6 +27,8 @@ SECTIONS = (
     ("safety.limits", "appliance.llm.settings", "RobotLimits"),
     ("robots", "appliance.robots.settings", "RobotsConfig"),
     ("robots.mavlink", "appliance.model.robot_api", "MavlinkLink"),
+    ("floor", "appliance.floor.settings", "FloorConfig"),
+    ("floor.robots", "appliance.floor.settings", "SizeConfig"),
     ("record", "appliance.record.settings", "RecordConfig"),
     ("tasks", "appliance.tasks.settings", "TasksConfig"),
     ("tasks.detection", "appliance.tasks.settings", "DetectionConfig"),

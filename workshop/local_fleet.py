@@ -195,18 +195,22 @@ class _Starting:
                 *(each for at in numbers for each in ("--to", f"udp://127.0.0.1:{udp_ports[at]}")),
                 "--system",
                 str(numbers[0] + 1),
+                "--spot",
+                str(numbers[0]),
                 "--site",
                 order.site,
                 "--rate",
                 str(order.sim_rate),
             )
-        for rover in rovers:
+        for number, rover in enumerate(rovers):
             self._spawn(
                 rover,
                 "sim",
                 "zenoh",
                 "--name",
                 rover,
+                "--spot",
+                str(number),
                 "--fleet",
                 order.fleet,
                 *(each for endpoint in endpoints for each in ("--connect", endpoint)),

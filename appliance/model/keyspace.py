@@ -41,6 +41,7 @@ from appliance.model import (
     transfer_api,
 )
 from appliance.model.closures import Closure
+from appliance.model.floor import FloorState
 from appliance.model.keys import RecordKind, Topic, Untyped, Verb
 from appliance.model.learning import ClientStatus, RoundRecord, RunMetric, RunRecord
 from appliance.model.roles import OPERATORS, PEOPLE, Role
@@ -304,6 +305,17 @@ ROBOT = Topic(
     kept="by each listener; offline after its token goes, forgotten 5 min later",
     puts=OWNERS,
     reads=ALL,
+)
+FLOOR = Topic(
+    "floor/{robot}",
+    FloorState,
+    "FloorState `{robot, gateway, task, command, state, place, way, waits_for, why, ticket, waited_s, in_line, "
+    "stuck}`: the way that a robot has reserved, or what it waits for",
+    writer="the gateway whose run moves it",
+    often="on change, and every 2 s while it moves or waits",
+    kept="by each gateway, 6 s",
+    puts=GATEWAYS,
+    reads=WATCHERS,
 )
 COMMAND = Topic(
     "robot/{robot}/command",

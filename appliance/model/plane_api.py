@@ -169,9 +169,12 @@ LONGEST_S = 30.0
 """Longest lease, seconds; for so long a restarted grantor grants nothing, since it has forgotten its grants."""
 
 Fence = Annotated[int, Meta(ge=1, le=2**53)]
+MOST_PARTS = 8192
+"""Parts of one key that one holder has at most."""
+Part = Annotated[str, Meta(min_length=1, max_length=120)]
 
 
-class LeaseAsk(Struct, frozen=True, kw_only=True):
+class LeaseAsk(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """`lease_grant`: grant the holder this key for so long, under this fence."""
 
     key: str
@@ -181,6 +184,13 @@ class LeaseAsk(Struct, frozen=True, kw_only=True):
     ttl_s: Annotated[float, Meta(gt=0, le=LONGEST_S)]
     voters: str
     """Digest of the grantors as the asker is configured."""
+    parts: Annotated[tuple[Part, ...], Meta(max_length=MOST_PARTS)] = ()
+    """What of the key: two holders may have parts that are different. None: all of it."""
+    after: Annotated[int, Meta(ge=0, le=2**53)] = 0
+    """Refuse it when the holder has a grant of a higher fence than this: somebody else asks for it by now. 0: whatever
+    it has."""
+    cleared: Annotated[tuple[str, ...], Meta(max_length=MOST_PARTS)] = ()
+    """Holders whose parts are free once their lease has ended: the asker knows that they have left them."""
 
 
 class LeaseEnd(Struct, frozen=True, kw_only=True):
@@ -201,7 +211,9 @@ class Granted(Struct, frozen=True, kw_only=True, omit_defaults=True):
     holder: str = ""
     """Where not granted: who has the grant; empty: nobody, the fence was too low."""
     left_s: float = 0.0
-    """For how much longer."""
+    """For how much longer; 0: its lease on these parts has ended, and nobody has said that it left them."""
+    part: str = ""
+    """One of the parts that it has, where parts were asked for."""
 
 
 class Released(Struct, frozen=True):

@@ -59,6 +59,9 @@ class RobotInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
     holding: str = ""
     online: bool = True
     note: str = ""
+    radius_m: float | None = None
+    """Of the circle on the ground that holds it and what it carries; None: it does not say."""
+    height_m: float | None = None
     limits: RobotLimits | None = None
     """As it has registered itself with."""
     speed_mps: float | None = None
@@ -109,6 +112,8 @@ MAX_METRES = 2.1e7
 LOWEST_M, HIGHEST_M = -12_000.0, 100_000.0
 """Of the deepest sea, and of where the atmosphere ends."""
 MAX_MPS = 1000.0
+MAX_SIZE_M = 20.0
+"""Of a robot."""
 MAX_ITEMS = 32_767
 """Of a mission."""
 MAX_VERBS = 128
@@ -177,6 +182,8 @@ _FIELDS: dict[str, tuple[Callable[[Any], bool], Any]] = {
     "verbs": (_texts(MAX_VERBS, MAX_NAME), ()),
     "pose": (plausible_pose, None),
     "home": (plausible_pose, None),
+    "radius_m": (lambda metres: within(metres, 0.01, MAX_SIZE_M), None),
+    "height_m": (lambda metres: within(metres, 0.01, MAX_SIZE_M), None),
     "battery_percent": (plausible_battery, None),
     "mode": (_text(MAX_NAME), ""),
     "holding": (_text(MAX_TEXT), ""),

@@ -21,6 +21,9 @@ class Place(Struct, frozen=True, kw_only=True, omit_defaults=True):
     y: float
     z: float = 0.0
     aliases: tuple[str, ...] = ()
+    capacity: int | None = None
+    """How many robots may be there at a time, 1 to 16; None: 1 at docks, shelves, chargers and landing pads, 4
+    elsewhere."""
 
 
 class Box(Struct, frozen=True, kw_only=True, omit_defaults=True):

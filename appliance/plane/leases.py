@@ -3,6 +3,10 @@
 Each key has r grantors, the first on the ring of all gateways that `plane.voters` names, whether they are there or
 not; a lease needs the grant of a majority of them, and any two majorities have one in common.
 
+A key may be leased in parts (the cells of a floor): two holders have it at once when no part is in both leases. Parts
+outlast their lease: what held them, such as a robot, may still be there, so an ended lease on parts stands in the way
+until an asker says that its holder has left them (`LeaseAsk.cleared`).
+
 `Grantor` and the functions of answers are pure: time is passed in, and nothing is stored or sent. A grantor holds one
 live grant for each key. It numbers grants by fences that only increase, over all its keys, so that what was sent
 before a grant cannot replace it however late it arrives, and a resource that remembers the highest fence it has seen
@@ -19,11 +23,12 @@ import random
 import secrets
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from typing import TypeVar
 
 import structlog
 from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance.errors import ConfigError, ConflictError, PayloadError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import keyspace
@@ -42,11 +47,20 @@ _MOST_JUMP = 2**32
 
 
 class Grant(Struct, frozen=True):
-    """A key granted to a holder until a time on the grantor's clock."""
+    """A key, or parts of it, granted to a holder until a time on the grantor's clock."""
 
     holder: str
     fence: int
     until: float
+    parts: frozenset[str] = frozenset()
+    before: "Grant | None" = None
+    """What it had before it got more parts: a release of this fence brings it back."""
+
+    def bars(self, asked: LeaseAsk, now: float) -> bool:
+        """Whether it stands in the way of what another asks for."""
+        if self.until <= now and (not self.parts or self.holder in asked.cleared):
+            return False
+        return not asked.parts or not self.parts or not self.parts.isdisjoint(asked.parts)
 
 
 class Grantor:
@@ -61,10 +75,14 @@ class Grantor:
         self.fence = fence
         """Must be on the disk before the answer that made it is sent."""
         self._quiet_until = now + LONGEST_S if fence else now
-        self._grants: dict[str, Grant] = {}
+        self._grants: dict[str, dict[str, Grant]] = {}
+        """By key and holder."""
 
     def grant(self, asked: LeaseAsk, now: float) -> Granted:
         """Grant a key, also again to its holder, unless another has it or the fence is not higher than any before.
+
+        Of a key in parts the holder keeps what it has until it renews (`after`) with less: what is refused it elsewhere
+        costs it nothing.
 
         Raises:
             RefusedError: it was restarted less than the longest lease ago, or holds too many grants.
@@ -78,33 +96,59 @@ class Grantor:
             )
         if asked.fence > self.fence + _MOST_JUMP:
             raise PayloadError(f"a fence of {asked.fence:,} after {self.fence:,}")
-        held = self._grants.get(asked.key)
-        if held is not None and held.until <= now:
-            del self._grants[asked.key]
-            held = None
-        if held is not None and held.holder != asked.holder:
-            return Granted(fence=self.fence, holder=held.holder, left_s=held.until - now)
+        held = self._grants.setdefault(asked.key, {})
+        mine = held.get(asked.holder)
+        if mine is not None and not mine.parts and mine.until <= now:
+            mine = None
+        if mine is not None and 0 < asked.after < mine.fence:
+            return Granted(fence=self.fence, holder=asked.holder, left_s=max(0.0, mine.until - now))
+        bars = [each for each in held.values() if each.holder != asked.holder and each.bars(asked, now)]
+        if bars:
+            other = max(bars, key=lambda each: (each.until, each.holder))
+            part = max(other.parts.intersection(asked.parts), default="")
+            return Granted(fence=self.fence, holder=other.holder, left_s=max(0.0, other.until - now), part=part)
         if asked.fence <= self.fence:
             return Granted(fence=self.fence)
-        if held is None:
+        if mine is None:
             self._make_room(now)
+        held = self._grants.setdefault(asked.key, {})
+        for name in [each.holder for each in held.values() if each.until <= now and each.holder in asked.cleared]:
+            del held[name]
+        parts = frozenset(asked.parts)
+        if mine is not None and mine.parts and not (asked.after and parts <= mine.parts):
+            parts, before = parts | mine.parts, replace(mine, before=None)
+        else:
+            before = None
         # Never shorter than what the holder was told before: it may not hear this answer.
-        until = max(now + asked.ttl_s, now if held is None else held.until)
-        self._grants[asked.key] = Grant(asked.holder, asked.fence, until)
+        until = max(now + asked.ttl_s, now if mine is None else mine.until)
+        held[asked.holder] = Grant(asked.holder, asked.fence, until, parts, before)
         self.fence = asked.fence
         return Granted(granted=True, fence=asked.fence)
 
     def _make_room(self, now: float) -> None:
-        if len(self._grants) < MOST_GRANTS:
+        if sum(len(held) for held in self._grants.values()) < MOST_GRANTS:
             return
-        self._grants = {key: held for key, held in self._grants.items() if held.until > now}
-        if len(self._grants) >= MOST_GRANTS:
+        kept = {
+            key: {name: each for name, each in held.items() if each.parts or each.until > now}
+            for key, held in self._grants.items()
+        }
+        self._grants = {key: held for key, held in kept.items() if held}
+        if sum(len(held) for held in self._grants.values()) >= MOST_GRANTS:
             raise RefusedError(f"holds {MOST_GRANTS:,} grants", remedy="release leases, or ask for shorter ones")
 
     def release(self, ended: LeaseEnd) -> None:
-        """Drop a grant, if it is still the one of that fence: a renewal that overtook the release stays."""
-        held = self._grants.get(ended.key)
-        if held is not None and (held.holder, held.fence) == (ended.holder, ended.fence):
+        """Drop a grant, if it is still the one of that fence: a renewal that overtook the release stays.
+
+        Parts that its holder had before stay its own.
+        """
+        held = self._grants.get(ended.key, {})
+        mine = held.get(ended.holder)
+        if mine is None or mine.fence != ended.fence:
+            return
+        del held[ended.holder]
+        if mine.before is not None:
+            held[ended.holder] = mine.before
+        elif not held:
             del self._grants[ended.key]
 
 
@@ -166,6 +210,17 @@ class Lease(Struct, frozen=True, kw_only=True):
     def left_s(self) -> float:
         """Seconds that are left; 0 when it has ended."""
         return max(0.0, self.until - _holder_clock())
+
+
+class Claim(Struct, frozen=True, kw_only=True):
+    """What came of asking for parts of a key: the lease, or who stands in the way."""
+
+    lease: Lease | None = None
+    holder: str = ""
+    part: str = ""
+    """One of the parts that the other has."""
+    ended: bool = False
+    """Whether the other's lease has ended, and it has not been seen to leave."""
 
 
 class Leases:
@@ -231,6 +286,50 @@ class Leases:
                 raise ConflictError(f"{key} is contended", remedy="try again in a moment")
             await asyncio.sleep(random.uniform(*_BACK_OFF_S))  # noqa: S311 - spreads load, protects nothing
 
+    async def claim(
+        self,
+        key: str,
+        holder: str,
+        parts: Collection[str],
+        *,
+        ttl_s: float,
+        after: int = 0,
+        cleared: Collection[str] = (),
+    ) -> Claim:
+        """Lease parts of a key, all or none, for `ttl_s` seconds; renew, give up a part and get another alike.
+
+        Args:
+            key: what the parts are of: it names the grantors, and all parts have the same.
+            holder: what holds them, such as a robot. Whoever asks for it has what it holds, at whatever gateway.
+            parts: all that it needs from now on. What else it holds is given up with the first renewal.
+            ttl_s: at most 30.
+            after: fence of the lease that this renews: refused, with the holder's own name, where somebody else has
+                asked for the holder since. 0: take over what it holds.
+            cleared: holders that are known to have left what they held, where their leases have ended.
+
+        Raises:
+            ConfigError, UnreachableError: as `acquire`.
+            ConflictError: others ask for the same at this moment.
+        """
+        if not parts:
+            raise PayloadError(f"no parts of {key} are asked for")
+        wanted, free = tuple(sorted(parts)), tuple(sorted(cleared))
+        until = time.monotonic() + _TRY_S
+        while True:
+            fence, lease, answers = await self._ask(key, holder, ttl_s, parts=wanted, after=after, cleared=free)
+            if lease is not None:
+                return Claim(lease=lease)
+            if any(answer.granted for answer in answers):
+                await self._end(key, holder, fence)
+            others = [answer for answer in answers if answer.holder]
+            if others and len(answers) >= majority(len(self.grantors(key))):
+                other = max(others, key=lambda answer: (answer.left_s, answer.part))
+                return Claim(holder=other.holder, part=other.part, ended=other.left_s <= 0.0)
+            self._refuse(key, answers)
+            if time.monotonic() > until:
+                raise ConflictError(f"{key} is contended", remedy="try again in a moment")
+            await asyncio.sleep(random.uniform(*_BACK_OFF_S))  # noqa: S311 - spreads load, protects nothing
+
     async def renew(self, lease: Lease, *, ttl_s: float) -> Lease:
         """Hold a lease for `ttl_s` seconds from now; when that fails the lease given lasts as long as it did.
 
@@ -256,7 +355,16 @@ class Leases:
 
     # --- asking -----------------------------------------------------------------------------------------------
 
-    async def _ask(self, key: str, holder: str, ttl_s: float) -> tuple[int, Lease | None, list[Granted]]:
+    async def _ask(
+        self,
+        key: str,
+        holder: str,
+        ttl_s: float,
+        *,
+        parts: tuple[str, ...] = (),
+        after: int = 0,
+        cleared: tuple[str, ...] = (),
+    ) -> tuple[int, Lease | None, list[Granted]]:
         """Ask all grantors once, under a fence above all that were heard of.
 
         Returns:
@@ -266,7 +374,16 @@ class Leases:
         if not 0 < ttl_s <= LONGEST_S:
             raise ConfigError(f"a lease of {ttl_s:g} s", remedy=f"more than 0, at most {LONGEST_S:g} s")
         self._highest += 1
-        ask = LeaseAsk(key=key, holder=holder, fence=self._highest, ttl_s=ttl_s, voters=self.digest)
+        ask = LeaseAsk(
+            key=key,
+            holder=holder,
+            fence=self._highest,
+            ttl_s=ttl_s,
+            voters=self.digest,
+            parts=parts,
+            after=after,
+            cleared=cleared,
+        )
         # From before they are asked: each grant ends later than this.
         until = _holder_clock() + ttl_s * (1 - _DRIFT)
 

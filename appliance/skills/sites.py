@@ -94,6 +94,8 @@ def _check_places(file: Path, site: Site) -> None:
         for axis, value in (("x", place.x), ("y", place.y), ("z", place.z)):
             if not math.isfinite(value):
                 raise _wrong(file, f"places.{name}.{axis}", f"{value} is no coordinate")
+        if place.capacity is not None and not 1 <= place.capacity <= 16:
+            raise _wrong(file, f"places.{name}.capacity", f"{place.capacity} is not between 1 and 16")
         if not 0 <= place.z <= site.altitude_limit_m:
             raise _wrong(file, f"places.{name}.z", f"{place.z} m is not between 0 and altitude_limit_m")
         if site.fence is not None and not inside(site.fence, place.x, place.y, 1e-6):

@@ -106,6 +106,7 @@ from appliance.tasks.replan import (
 )
 from appliance.tasks.steering import may_pause, may_resume, may_retry, needed_robots, proposal_for, word_of
 from appliance.tasks.timing import Backoff, left_s, passed
+from appliance.tasks.views import WAITS
 
 log = structlog.get_logger(__name__)
 
@@ -556,8 +557,10 @@ class Decider:
             case RunEventKind.PROGRESS:
                 if event.choice is not None:
                     self._passed_on(event, event.choice)
+                # What it waits for, and that it waits no longer, is for everybody to see at once.
+                waits = WAITS in (event.note[: len(WAITS)], target.note[: len(WAITS)]) and event.note != target.note
                 draft.offer(
-                    TransitionKind.PROGRESS, durable=False, progress=event.progress, note=event.note, **common
+                    TransitionKind.PROGRESS, durable=waits, progress=event.progress, note=event.note, **common
                 )  # fmt: skip
             case RunEventKind.SUCCEEDED:
                 self._partials.drop(event.subtask)
@@ -730,7 +733,7 @@ class Decider:
             asked_s=asked_s(target.subtask.params),
             config=self._context.config.detection,
         )
-        if found is None:
+        if found is None or (found.condition is Condition.STRAGGLING and target.note.startswith(WAITS)):
             return
         if target.condition != found.condition and self._notice(target, found.note, condition=str(found.condition)):
             self._notify(str(found.condition), target, found.note)

@@ -18,6 +18,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import ConflictError, PayloadError, RobotError, SwiftbotError, from_code
+from appliance.floor.keeper import FloorKeeper
 from appliance.model import Notice, RobotCommand, RobotReply, encode, keyspace
 from appliance.model.keys import check_name
 from appliance.model.task_api import ArtifactAsk, ArtifactPiece
@@ -58,6 +59,7 @@ class Calls:
         on_wait: Callable[[Call, str], None],
         hindrance: Callable[[str], str] = lambda _: "",
         enquiries: Enquiries | None = None,
+        floor: FloorKeeper | None = None,
         orders: Orders = lambda _, command, __, ___: command,
     ) -> None:
         """Make them.
@@ -69,12 +71,14 @@ class Calls:
             on_wait: told what a call waits for.
             hindrance: why a robot may not be commanded just now, "" when it may.
             enquiries: takes questions to people.
+            floor: keeps robots apart; None: they are moved at once.
             orders: returns an order as it may be sent to a robot, given the arguments that no plan asked for and
                 whether an earlier attempt may have begun it; raises a SwiftbotError with the reason when it may not be.
         """
         self._orders = orders
         self._enquiries = enquiries
         self._hindrance = hindrance
+        self._floor = floor
         self._plane = plane
         self._artifacts = artifacts
         self._copies = copies
@@ -118,26 +122,18 @@ class Calls:
         )
         # The same id of an earlier attempt: a robot that drives it already is joined, one that has done it answers.
         begun = run.attempt > 1 or run.resume is not None
-        give_up = time.monotonic() + timeout_s
+        deadline = _Deadline(timeout_s)
         while True:
-            await self._until_free(call, run.robot, give_up)
+            await self._until_free(call, run.robot, deadline.at)
             # What the robot and its site allow may have changed meanwhile, and so may where it is.
             sent = self._orders(run.robot, command, CHOSEN - run.params.keys(), begun)
-            left = give_up - time.monotonic()
-            doubtful = self._plane.registry.doubtful(run.robot)
-            reply = await self._noting_loss(
-                call,
-                run.robot,
-                send_command(
-                    self._plane.session, run.robot, sent, timeout_s=max(0.1, left), doubtful=doubtful,
-                    on_silence=lambda note: self._on_wait(call, note),
-                ),
-            )  # fmt: skip
+            reply = await self._drive(call, run.robot, sent, deadline, begun=begun)
+            left = deadline.left_s
             if reply.failure is None:
                 return _answer(reply)
             if reply.failure.code == "cancelled" and await self._was_stopped(run.robot):
                 # Its task hears of the stop or lease as well, and ends this run; its next attempt does the rest.
-                await self._until_free(call, run.robot, give_up)
+                await self._until_free(call, run.robot, deadline.at)
             if reply.failure.code != "busy" or left <= BUSY_RETRY_S:
                 error = from_code(reply.failure.code, reply.failure.message, reply.failure.remedy)
                 if type(error) is SwiftbotError:
@@ -145,6 +141,26 @@ class Calls:
                 raise error
             self._on_wait(call, f"waits for {run.robot}: {reply.failure.message}")
             await asyncio.sleep(BUSY_RETRY_S)
+
+    async def _drive(
+        self, call: Call, robot: str, command: RobotCommand, deadline: "_Deadline", *, begun: bool
+    ) -> RobotReply:
+        """Send a command once its robot has a way, where it moves it; returns the answer."""
+
+        async def send(sent: RobotCommand) -> RobotReply:
+            if sent is not command:  # a way of the floor's: held to the same limits
+                sent = self._orders(robot, sent, CHOSEN, begun)
+            sending = send_command(
+                self._plane.session, robot, sent, timeout_s=max(0.1, deadline.left_s),
+                doubtful=self._plane.registry.doubtful(robot), on_silence=lambda note: self._on_wait(call, note),
+            )  # fmt: skip
+            return await self._noting_loss(call, robot, sending)
+
+        if self._floor is None:
+            return await send(command)
+        return await self._floor.drive(
+            robot, command, send=send, on_wait=lambda note: self._on_wait(call, note), on_waited=deadline.extend
+        )
 
     async def _noting_loss(self, call: Call, robot: str, sending: Coroutine[Any, Any, RobotReply]) -> RobotReply:
         """Wait for a robot's answer, and tell when the robot is lost meanwhile, and when it is back."""
@@ -258,6 +274,20 @@ class Calls:
             owner=call.run.owner or task_key(call.run.task),
         )
         return {"data": data}
+
+
+class _Deadline:
+    """When a command is given up; waiting for others on the floor does not count."""
+
+    def __init__(self, timeout_s: float) -> None:
+        self.at = time.monotonic() + timeout_s
+
+    @property
+    def left_s(self) -> float:
+        return self.at - time.monotonic()
+
+    def extend(self, seconds: float) -> None:
+        self.at += seconds
 
 
 def _timeout(value: object) -> float:

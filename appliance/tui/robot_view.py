@@ -90,7 +90,7 @@ class Robot(Struct, frozen=True, kw_only=True):
 
 
 def missions(record: TaskRecord) -> dict[str, str]:
-    """Return what robots do just now for a task, by robot: `task/subtask skill` and how far it is."""
+    """Return what robots do just now for a task, by robot: `task/subtask skill`, how far, and what it waits for."""
     if record.state.final:
         return {}
     found: dict[str, str] = {}
@@ -98,7 +98,8 @@ def missions(record: TaskRecord) -> dict[str, str]:
         robot = each.bound_robot or each.subtask.robot
         if robot and each.state in _BUSY:
             share = f" {min(1.0, max(0.0, each.progress)):.0%}" if each.progress else ""
-            found[robot] = f"{record.id}/{each.subtask.id} {each.subtask.skill}{share}"
+            waits = f" {each.note}" if each.note.startswith("waits for ") else ""
+            found[robot] = f"{record.id}/{each.subtask.id} {each.subtask.skill}{share}{waits}"
     return found
 
 

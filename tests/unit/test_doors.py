@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 APPLIANCE = ROOT / "appliance"
-ROOMS = ("llm", "plane", "pool", "record", "robots", "skills", "tasks", "tui")
+ROOMS = ("floor", "llm", "plane", "pool", "record", "robots", "skills", "tasks", "tui")
 
 
 def doors(room: str) -> set[str]:

@@ -28,6 +28,7 @@ def mavlink(
     site: str = "warehouse",
     rate: float = 1.0,
     start: str = "home",
+    spot: int = 0,
     kind: Literal["copter", "rover"] = "copter",
     parameter: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     drop: float = 0.0,
@@ -47,6 +48,7 @@ def mavlink(
         site: Built-in site or site file.
         rate: How many times faster than real it moves.
         start: Place it starts at.
+        spot: Which spot beside it, nearest first, of the first vehicle; 0 is the place itself.
         kind: A multirotor or a rover.
         parameter: NAME=VALUE of its autopilot that differ from the usual, such as SIM_WIND_SPD=6 or FENCE_ENABLE=1.
         drop: Share of frames that its link loses, each way.
@@ -69,6 +71,7 @@ def mavlink(
             rate=rate,
             streams=streams,
             start=start,
+            spot=spot + number,
             kind=kind,
             parameters=read_parameters(parameter),
             drop=drop,
@@ -88,7 +91,15 @@ def mavlink(
 
 
 @sim_app.command
-def zenoh(*, name: str, site: str = "warehouse", rate: float = 1.0, start: str = "charger", where: Where = HERE) -> int:
+def zenoh(
+    *,
+    name: str,
+    site: str = "warehouse",
+    rate: float = 1.0,
+    start: str = "charger",
+    spot: int = 0,
+    where: Where = HERE,
+) -> int:
     """Simulate a mobile robot with arm and camera that speaks Zenoh.
 
     Args:
@@ -96,6 +107,7 @@ def zenoh(*, name: str, site: str = "warehouse", rate: float = 1.0, start: str =
         site: Built-in site or site file.
         rate: How many times faster than real it moves.
         start: Place it starts at.
+        spot: Which spot beside it, nearest first; 0 is the place itself.
         where: The fleet.
     """
     from appliance.skills.sites import load_site
@@ -104,7 +116,13 @@ def zenoh(*, name: str, site: str = "warehouse", rate: float = 1.0, start: str =
     logs.configure(style="text")
     endpoint = where.endpoint()
     settings = RobotSettings(
-        name=name, fleet=endpoint.fleet, connect=endpoint.connect, site=load_site(site), rate=rate, start=start
+        name=name,
+        fleet=endpoint.fleet,
+        connect=endpoint.connect,
+        site=load_site(site),
+        rate=rate,
+        start=start,
+        spot=spot,
     )
 
     async def go() -> None:

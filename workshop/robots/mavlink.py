@@ -13,8 +13,9 @@ import structlog
 from msgspec import Struct, field
 
 from appliance.errors import ConfigError
-from appliance.model import Site
+from appliance.model import Place, Site
 from appliance.model.robot_api import MAX_SYSTEM, Remote, read_remote
+from appliance.model.site import inside
 from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.links import Link, open_link
@@ -47,6 +48,8 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
     system: int = 1
     site: Site = field(default_factory=Site)
     start: str = "home"
+    spot: int = 0
+    """Beside it: 0 is the place itself."""
     """Place it starts at, and its home; the site's origin where there is no such place."""
     rate: float = 1.0
     """How many times faster than real it moves."""
@@ -90,15 +93,33 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
         self.air.check()
 
 
-def start_point(site: Site, start: str) -> tuple[float, float]:
-    """Return where a robot starts; ConfigError for a place the site does not have."""
+_SPOT_M = 2.0
+"""Between robots that start side by side."""
+
+
+def start_point(site: Site, start: str, spot: int = 0) -> tuple[float, float]:
+    """Return where a robot starts; ConfigError for a place the site does not have.
+
+    `spot`: 0 is the place itself, the others are round it, nearest first, side by side and clear of obstacles; where
+    there are no more, it is counted on from the first.
+    """
     place = site.find(start)
     if place is None:
-        if not site.places:
-            return 0.0, 0.0
-        known = ", ".join(sorted(site.places))
-        raise ConfigError(f"start {start!r} is no place of site {site.name}", remedy=f"known places: {known}")
-    return place.x, place.y
+        if site.places:
+            known = ", ".join(sorted(site.places))
+            raise ConfigError(f"start {start!r} is no place of site {site.name}", remedy=f"known places: {known}")
+        place = Place(x=0.0, y=0.0)
+    steps = range(-8, 9)
+    spots = sorted(((dx, dy) for dx in steps for dy in steps), key=lambda each: (math.hypot(*each), each))
+    walls = (*site.obstacles, *site.forbidden)
+
+    def clear(x: float, y: float) -> bool:
+        fenced = site.fence is None or inside(site.fence, x, y, -_SPOT_M / 2)
+        return fenced and not any(inside(wall, x, y, _SPOT_M / 2) for wall in walls)
+
+    round_it = [(place.x + _SPOT_M * dx, place.y + _SPOT_M * dy) for dx, dy in spots[1:]]
+    near = [(place.x, place.y), *(point for point in round_it if clear(*point))]
+    return near[spot % len(near)]
 
 
 def read_parameters(given: Sequence[str]) -> dict[str, float]:
@@ -139,7 +160,7 @@ def make_vehicle(settings: VehicleSettings) -> AnyAutopilot:
     vehicle = kind(
         system=settings.system,
         site=settings.site,
-        home=start_point(settings.site, settings.start),
+        home=start_point(settings.site, settings.start, settings.spot),
         battery_percent=settings.battery_percent,
     )
     for name, value in settings.parameters.items():

@@ -79,6 +79,8 @@ class RobotSettings(Struct, frozen=True, kw_only=True):
     site: Site = field(default_factory=Site)
     start: str = "charger"
     """Place it starts at, and its home; the site's origin where the site has no places."""
+    spot: int = 0
+    """Beside it: 0 is the place itself."""
     rate: float = 1.0
     """How many times faster than real it moves."""
     battery_percent: float = 100.0
@@ -86,7 +88,7 @@ class RobotSettings(Struct, frozen=True, kw_only=True):
     def check(self) -> None:
         """Raise ConfigError or PayloadError for what cannot be simulated."""
         check_name(self.name, "robot")
-        start_point(self.site, self.start)
+        start_point(self.site, self.start, self.spot)
         if not (math.isfinite(self.rate) and 0.0 < self.rate <= 100.0):
             raise ConfigError(f"rate {self.rate:g}", remedy="use more than 0, at most 100")
 
@@ -129,7 +131,7 @@ class Rover:
     def __init__(self, settings: RobotSettings, session: Session) -> None:
         self.name = settings.name
         self.world = World(settings.site)
-        self.home = start_point(settings.site, settings.start)
+        self.home = start_point(settings.site, settings.start, settings.spot)
         self.driving = Driving(*self.home, battery_percent=settings.battery_percent)
         self.refused: dict[str, int] = {}
         self._speaker = f"{time.time_ns():020d}-{secrets.token_hex(4)}"

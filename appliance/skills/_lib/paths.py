@@ -88,11 +88,13 @@ def rectangles(boxes: Sequence[Mapping[str, Any]]) -> list[Rectangle]:
     ]
 
 
-def plan(start: Point, goal: Point, closed: Sequence[Rectangle], *, clearance: float = CLEARANCE_M) -> list[Point]:
+def plan(
+    start: Point, goal: Point, closed: Sequence[Rectangle], *, clearance: float = CLEARANCE_M, tries: int = 3
+) -> list[Point]:
     """Return the waypoints from `start` (left out) to `goal` (the last), metres.
 
     No leg passes through the inside of a rectangle of `closed`. Where start or goal are nearer to one than
-    `clearance`, that one's clearance shrinks to what they have.
+    `clearance`, that one's clearance shrinks to what they have. `tries`: grids that are searched, each finer.
 
     Raises:
         NoPath: start or goal is inside a closed area, or everything between them is closed.
@@ -107,7 +109,7 @@ def plan(start: Point, goal: Point, closed: Sequence[Rectangle], *, clearance: f
     walls = [box.grown(min(clearance, 0.9 * box.gap(start), 0.9 * box.gap(goal))) for box in closed]
     if free(start, goal, walls):
         return [goal]
-    for finer in (1, 2, 3):
+    for finer in range(1, tries + 1):
         cells = _search(start, goal, walls, CELLS * finer * finer)
         if cells is not None:
             return _straighten([start, *cells, goal], walls)[1:]

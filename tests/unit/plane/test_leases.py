@@ -199,3 +199,89 @@ def test_absurd_fences_and_too_many_grants_are_refused(monkeypatch: pytest.Monke
     with pytest.raises(RefusedError):
         grantor.grant(ask("a", 3, key="k3"), 1.0)
     assert grantor.grant(ask("a", 3, key="k3"), 10.0).granted
+
+
+def part(
+    name: str, fence: int, *parts: str, ttl_s: float = 10.0, after: int = 0, cleared: tuple[str, ...] = ()
+) -> LeaseAsk:
+    """A request for parts."""
+    return LeaseAsk(
+        key=KEY, holder=name, fence=fence, ttl_s=ttl_s, voters="", parts=parts, after=after, cleared=cleared
+    )
+
+
+def test_parts_exclude_one_another() -> None:
+    """Holders of one key have different parts; the refusal names one that another has."""
+    grantor = Grantor(fence=0, now=0.0)
+    assert grantor.grant(part("a", 1, "1", "2"), 0.0).granted
+    assert grantor.grant(part("b", 2, "3"), 0.0).granted
+    refused = grantor.grant(part("c", 3, "2", "4"), 0.0)
+    assert (refused.granted, refused.holder, refused.part) == (False, "a", "2")
+    assert not grantor.grant(ask("c", 4), 0.0).granted, "all of a key of which others have parts"
+
+
+def test_parts_outlast_their_lease() -> None:
+    """What held them may still be there: they are free once an asker says that it has left."""
+    grantor = Grantor(fence=0, now=0.0)
+    assert grantor.grant(part("a", 1, "1"), 0.0).granted
+    refused = grantor.grant(part("b", 2, "1"), 11.0)
+    assert (refused.granted, refused.holder, refused.left_s) == (False, "a", 0.0)
+    assert not grantor.grant(part("b", 3, "1", cleared=("a",)), 9.0).granted, "a lease that lasts is not cleared"
+    assert grantor.grant(part("b", 4, "1", cleared=("a",)), 11.0).granted
+
+
+def test_parts_are_given_up_by_asking_for_fewer() -> None:
+    """More are added to what is held until it is renewed; a release takes back the last addition alone."""
+    grantor = Grantor(fence=0, now=0.0)
+    assert grantor.grant(part("a", 1, "1", "2"), 0.0).granted
+    assert grantor.grant(part("a", 2, "2", "3"), 0.0).granted
+    assert not grantor.grant(part("b", 3, "1"), 0.0).granted, "given up before a majority has granted the new ones"
+    grantor.release(end("a", 2))
+    assert grantor.grant(part("b", 4, "3"), 0.0).granted
+    assert grantor.grant(part("a", 5, "2"), 0.0).granted
+    assert not grantor.grant(part("b", 6, "1"), 0.0).granted
+    assert grantor.grant(part("a", 7, "2", after=5), 0.0).granted
+    assert grantor.grant(part("b", 8, "1", "3"), 0.0).granted
+
+
+def test_a_late_renewal_takes_nothing_from_a_later_asker() -> None:
+    """Two gateways ask for one robot: what the earlier one renews afterwards is refused in the robot's own name."""
+    grantor = Grantor(fence=0, now=0.0)
+    assert grantor.grant(part("a", 1, "1", "2"), 0.0).granted
+    assert grantor.grant(part("a", 2, "2", "3"), 0.0).granted
+    refused = grantor.grant(part("a", 3, "2", after=1), 0.0)
+    assert (refused.granted, refused.holder) == (False, "a")
+    assert not grantor.grant(part("b", 4, "3"), 0.0).granted
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_part_has_two_holders(seed: int) -> None:
+    """Three grantors on a network that is cut at random: those granted by a majority never share a part."""
+    generator = random.Random(seed)  # noqa: S311 - no secret
+    grantors = [Grantor(fence=0, now=0.0) for _ in range(GRANTORS)]
+    now, fence = 0.0, 0
+    held: dict[str, tuple[frozenset[str], float]] = {}
+    fences: dict[str, int] = {}
+    for _ in range(400):
+        now += generator.choice((0.0, 0.5, 4.0))
+        name, fence = generator.choice(ASKERS), fence + 1
+        parts = tuple(sorted(generator.sample("12345678", generator.randint(1, 4))))
+        # Its own clock has ended a lease before its grantors' have, and only who is gone is cleared.
+        live = {each for each, (_, until) in held.items() if until > now}
+        after = 0
+        if name in live and generator.random() < 0.5:
+            # Renews with a part of what it has, and needs no more from now on.
+            before, until = held[name]
+            parts, after = tuple(sorted(before))[: generator.randint(1, len(before))], fences[name]
+            held[name] = frozenset(parts), until
+        asked = part(name, fence, *parts, after=after, cleared=tuple(set(ASKERS) - live))
+        answers: list[Granted] = []
+        for grantor in grantors:
+            if generator.random() < 0.6:
+                answer = grantor.grant(asked, now)
+                if generator.random() < 0.8:
+                    answers.append(answer)
+        if granted(answers, GRANTORS):
+            held[name], fences[name] = (frozenset(parts), now + asked.ttl_s), fence
+            for other, (theirs, until) in held.items():
+                assert other == name or until <= now or theirs.isdisjoint(parts)

@@ -116,3 +116,17 @@ def test_another_store_is_begun_anew() -> None:
     second.robots.put("r2", RobotInfo(id="r2", kind="zenoh"))
     assert list(known.of(second)) == ["r2"]
     assert list(known.of(first)) == ["r1"]
+
+
+def test_a_robot_that_waits_says_for_whom() -> None:
+    """The row of a robot has what its subtask waits for beside what it does."""
+    subtask = Subtask(id="s1", skill="goto", robot="r1")
+    noted = {"waits for r2 to leave dock 1": " waits for r2 to leave dock 1", "going to dock 1: 30 m": ""}
+    for note, shown in noted.items():
+        record = TaskRecord(
+            id="t1",
+            instruction="",
+            state=TaskState.RUNNING,
+            subtasks=(SubtaskRecord(subtask=subtask, state=SubtaskState.RUNNING, note=note),),
+        )
+        assert missions(record) == {"r1": f"t1/s1 goto{shown}"}

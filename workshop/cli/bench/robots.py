@@ -6,7 +6,7 @@ from cyclopts import Parameter
 
 from appliance.cli.common import Json
 from appliance.errors import Exit
-from workshop.cli.bench.common import bench_app, measure, say, tell
+from workshop.cli.bench.common import Ints, bench_app, measure, say, tell
 
 
 @bench_app.command
@@ -80,3 +80,30 @@ def bench_fleet(
     found = measure(run(options, progress=say))
     tell(found, as_json=as_json)
     return Exit.DONE if all(each["kept"] for each in found["targets"].values()) else Exit.FAILED
+
+
+@bench_app.command
+def floor(
+    *,
+    robots: Ints = (4, 8, 16, 32),
+    seconds: float = 600.0,
+    site: str = "warehouse",
+    seed: int = 1,
+    down_s: float = 10.0,
+    as_json: Json = False,
+) -> int:
+    """Simulate robots that share a floor: collisions, deadlocks, throughput; also one at a time and uncoordinated.
+
+    Args:
+        robots: How many, one simulation each.
+        seconds: Simulated time of each.
+        site: Built-in site or site file.
+        seed: Of the places that robots go to.
+        down_s: Seconds of each minute that one of the three grantors is down, in turn.
+    """
+    from workshop.bench import floor as floors
+
+    options = floors.Options(robots=robots, seconds=seconds, site=site, seed=seed, down_s=down_s)
+    found = floors.measure(options, progress=say)
+    tell(found, as_json=as_json)
+    return Exit.DONE if found["kept"] else Exit.FAILED

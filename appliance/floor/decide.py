@@ -1,0 +1,502 @@
+"""Decides whether a robot may go, by which way, or whom it waits for. Pure: what is seen comes in, decisions go out.
+
+Rules, in the order in which they are looked at:
+
+1. A place takes as many robots as its capacity says. Where one is there or on its way, the next ones wait; who has the
+   lower ticket goes first. Robots of one task may share a place, side by side: its plan has ordered them.
+2. A robot that stands keeps the ground under it, whether it has a task or not. Ways lead round it where there is room.
+   One that moves without a reservation (by hand, by a pilot, unknown) has the ground that it can reach in `HAND_S` too.
+3. A way is reserved as a whole before its robot moves, and freed behind it (`geometry.cells`). Who is refused looks for
+   a way round the one that has it; where that is too long, it waits. The way of the one that has waited longest of all,
+   for `PATIENCE_S` or more, is reserved by nobody else any more.
+4. A robot that waits and stands in the way of another that waits for it gives way: it goes to the nearest spot that is
+   in nobody's way. Where they wait for one another, in a ring of any length, only the one with the highest ticket does,
+   of those that have such a spot.
+"""
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import pairwise
+
+from msgspec import Struct
+
+from appliance.floor import geometry
+from appliance.floor.geometry import Flat, Size
+from appliance.model import Box, Site
+from appliance.model.floor import FloorState, Point
+from appliance.model.site import Place
+from appliance.skills._lib import paths
+
+PLACE_M = 1.0
+"""A robot that stands so near to a place is at it."""
+SIDE_M = 2.0
+"""The same where several stand side by side."""
+OUTSIDE_M = 5.0
+"""So broad is what lies outside of the fence, to a search for a way: broader than its grid's border."""
+PATIENCE_S = 60.0
+"""After so long the way that a robot waits for is kept free of others that began to wait later."""
+HAND_S = 2.0
+"""How long a robot that nobody here moves is expected to go on as it does."""
+APART_M = 0.1
+"""Between robots side by side, beside their margins."""
+DETOUR, DETOUR_M = 1.6, 4.0
+"""A way round a robot that moves is taken when it is at most so many times, and metres, longer."""
+YIELD_S = 2.0
+"""How long robots stand in each other's way before one gives way."""
+REFUGE_M = 14.0
+"""How far a robot goes to give way."""
+_REFUGES = 24
+"""Spots that are looked at, the nearest first."""
+_SINGLE = ("dock", "bay", "shelf", "charger", "charging", "helipad", "pad", "landing")
+SEVERAL = 4
+"""Robots at a place of which nothing says how many it takes, and that is none of those for one."""
+
+
+class Body(Struct, frozen=True, kw_only=True):
+    """A robot as it is seen."""
+
+    robot: str
+    at: Point
+    size: Size
+    speed_mps: float = 0.0
+    stands: bool = True
+    """It has not moved for a while; or nothing is heard of it, and that is where it was last."""
+    fresh: bool = True
+    """Whether it is heard."""
+    state: FloorState | None = None
+    """What the gateway says that moves it; None: nobody says anything."""
+
+    @property
+    def moved(self) -> bool:
+        """Whether a run moves it under a reservation."""
+        return self.state is not None and self.state.state == "moves"
+
+    @property
+    def waiting(self) -> FloorState | None:
+        """What it waits for."""
+        return self.state if self.state is not None and self.state.state == "waits" else None
+
+
+class Trip(Struct, frozen=True, kw_only=True):
+    """Where a command moves a robot."""
+
+    robot: str
+    task: str
+    command: str
+    points: tuple[Point, ...]
+    """Without where it is."""
+    flies: bool = False
+    fixed: bool = False
+    """Whether the robot follows just these points: they cannot be changed."""
+    ticket: int = 0
+
+
+class Go(Struct, frozen=True, kw_only=True):
+    """Reserve these parts, then go this way, whose first point is where the robot is."""
+
+    way: tuple[Point, ...]
+    parts: frozenset[str]
+    sweep: tuple[tuple[float, frozenset[str]], ...] = ()
+    """The cells piece by piece (`geometry.sweep`)."""
+    place: str = ""
+    yields: bool = False
+    """It gives way: the way does not end where the command ends."""
+
+
+class Wait(Struct, frozen=True, kw_only=True):
+    """Wait, and say why."""
+
+    robot: str
+    """Whose leaving it waits for; empty: nobody's."""
+    why: str
+    place: str = ""
+    way: tuple[Point, ...] = ()
+    """The way that it wants."""
+    in_line: bool = False
+    """It waits for the place itself."""
+
+
+class Floor:
+    """The map, and how many robots its places take."""
+
+    def __init__(self, site: Site) -> None:
+        self.site = site
+        self.capacity = {name: place.capacity or usual_capacity(name, place) for name, place in site.places.items()}
+        outside = _outside(site.fence) if site.fence is not None else ()
+        self._closed = [*outside, *(_rectangle(box) for box in (*site.forbidden, *site.obstacles))]
+        self._forbidden = [*outside, *(_rectangle(box) for box in site.forbidden)]
+
+    def problems(self, radius_m: float) -> tuple[str, ...]:
+        """Return what about the map keeps robots of that radius from their places, in words."""
+        found: list[str] = []
+        places = list(self.site.places)
+        for number, one in enumerate(places):
+            for other in places[number + 1 :]:
+                apart = math.dist(self._centre(one), self._centre(other))
+                if apart < 2 * radius_m and self.site.places[one].z == self.site.places[other].z:
+                    found.append(f"{one} and {other} are {apart:.1f} m apart: one robot stands at both")
+            walls = [wall.name for wall in self._closed if wall.grown(radius_m).holds(self._centre(one))]
+            if walls:
+                found.append(f"{one} is nearer to {walls[0]} than {radius_m:g} m: a robot there touches it")
+        return tuple(found)
+
+    # --- may it go? -------------------------------------------------------------------------------------------
+
+    def decide(self, trip: Trip, bodies: Mapping[str, Body], avoid: Collection[str] = ()) -> Go | Wait:
+        """Return the way to ask for, or whom to wait for.
+
+        Args:
+            trip: where to.
+            bodies: all robots that are seen, its own among them.
+            avoid: robots that have the shortest way reserved: look for one round theirs.
+        """
+        me = bodies[trip.robot]
+        others = [each for each in bodies.values() if each.robot != trip.robot and _meet(me, trip, each)]
+        place, goal = "", trip.points[-1]
+        if not trip.fixed:
+            found = self.place_at(goal, trip)
+            if found:
+                place = found
+                spot = self._spot(place, trip, me, others)
+                if isinstance(spot, Wait):
+                    return spot
+                goal = spot
+        points = (*trip.points[:-1], goal)
+        standing = [each for each in others if not each.moved]
+        straight: tuple[Point, ...] = (me.at, *points)
+        if trip.fixed:
+            way = straight if all(_clear(straight, each, me) for each in standing) else None
+        else:
+            walls = [wall for each in standing if (wall := _wall(each, me)) is not None]
+            way = self._route(me, points, walls, trip.flies)
+            if way is not None and avoid:
+                way = self._round(me, points, walls, [bodies[each] for each in avoid if each in bodies], trip) or way
+        if way is None and not standing:
+            way = straight  # the map closes it: the robot's side says so
+        if way is None:
+            nearest = min(standing, key=lambda each: geometry.from_way(each.at[:2], straight))
+            return Wait(robot=nearest.robot, why=_moves(nearest), place=place, way=straight)
+        sweep = geometry.sweep(way, me.size)
+        parts = frozenset[str]().union(*(cells for _, cells in sweep))
+        first = self._patient(trip, me, others, parts)
+        if first is not None:
+            # It is not in the way: nobody has to give way for that.
+            return Wait(robot="", why=f"waits for {first}, which has waited longer", place=place, way=way)
+        if place and self.capacity[place] == 1 and goal[:2] == self._centre(place):
+            parts |= {f"place/{place}"}
+        return Go(way=way, parts=parts, sweep=sweep, place=place)
+
+    def _patient(self, trip: Trip, me: Body, others: Sequence[Body], parts: frozenset[str]) -> str | None:
+        """Return the robot that has waited longest of all, too long, and would have to wait for this one too."""
+        waiting = [(each.waiting, each) for each in others if each.waiting and each.waiting.waited_s >= PATIENCE_S]
+        long = [(state, each) for state, each in waiting if not state.in_line and len(state.way) > 1 and state.ticket]
+        if not long:
+            return None
+        state, first = min(long, key=lambda each: each[0].ticket)
+        if state.waits_for == trip.robot or state.ticket > (trip.ticket or math.inf):
+            return None
+        wanted = geometry.cells(state.way, first.size)
+        # Who stands in its way may leave it.
+        leaves = not wanted.isdisjoint(geometry.cells((me.at,), me.size))
+        return None if leaves or wanted.isdisjoint(parts) else first.robot
+
+    def refused(self, go: Go, holder: str, part: str, bodies: Mapping[str, Body], *, ended: bool) -> Wait:
+        """Return whom to wait for, and why, where another has reserved a part of the way."""
+        other, place = bodies.get(holder), part.removeprefix("place/")
+        if ended and (other is None or not other.fresh):
+            why = f"waits for {holder}, which was lost on its way here"
+        elif ended:
+            why = f"waits for {holder} to stand still"
+        elif place != part:
+            why = _leaves(other, holder, place)
+        else:
+            why = f"waits for {holder} to pass"
+        return Wait(robot=holder, why=why, place=go.place, way=go.way, in_line=place != part)
+
+    # --- places -----------------------------------------------------------------------------------------------
+
+    def place_at(self, goal: Point, trip: Trip) -> str:
+        """Return the place that a robot on the ground goes to; "" for a coordinate."""
+        if trip.flies and goal[2] > PLACE_M:
+            return ""
+        near = {name: math.dist(goal[:2], self._centre(name)) for name in self.site.places}
+        name = min(near, key=lambda each: near[each], default="")
+        return name if name and near[name] <= 0.05 else ""
+
+    def _centre(self, place: str) -> Flat:
+        found = self.site.places[place]
+        return found.x, found.y
+
+    def _spot(self, place: str, trip: Trip, me: Body, others: Sequence[Body]) -> Point | Wait:
+        """Return where to stand at a place, or whom to wait for."""
+        there = [each for each in others if self._takes(place, each)]
+        strangers = [each for each in there if not (trip.task and each.state and each.state.task == trip.task)]
+        capacity, goal = self.capacity[place], trip.points[-1]
+        way = (me.at, goal)
+        if len(strangers) >= capacity:
+            # The one that stands there is left for first.
+            first = min(strangers, key=lambda each: (each.moved, each.robot))
+            why = _leaves(first, first.robot, place)
+            return Wait(robot=first.robot, why=why, place=place, way=way, in_line=True)
+        if math.dist(me.at[:2], self._centre(place)) > PLACE_M:
+            line = [state for each in others if (state := each.waiting) is not None and state.place == place]
+            before = [each for each in line if each.in_line and 0 < each.ticket < (trip.ticket or math.inf)]
+            if before and len(strangers) + len(before) >= capacity:
+                first_in_line = min(before, key=lambda each: each.ticket)
+                why = f"waits for {place}, after {first_in_line.robot}"
+                return Wait(robot=there[0].robot if there else "", why=why, place=place, way=way, in_line=True)
+        taken = [
+            (each.state.way[-1] if each.moved and each.state and each.state.way else each.at, each.size.kept_m)
+            for each in others
+        ]
+        for spot in self._spots(place, me.size, max(capacity, 1 + len(there))):
+            if all(math.dist(spot, end[:2]) >= me.size.kept_m + kept for end, kept in taken):
+                return (*spot, goal[2])
+        near = min(others, key=lambda each: math.dist(each.at[:2], self._centre(place)))
+        return Wait(robot=near.robot, why=_leaves(near, near.robot, place), place=place, way=way, in_line=True)
+
+    def is_at(self, body: Body, place: str) -> bool:
+        """Whether a robot stands at a place."""
+        return math.dist(body.at[:2], self._centre(place)) <= PLACE_M
+
+    def _takes(self, place: str, body: Body) -> bool:
+        """Whether a robot is at a place, or has it reserved."""
+        end = body.at
+        if body.moved and body.state is not None and body.state.way:
+            if body.state.place == place:
+                return True
+            end = body.state.way[-1]
+        if end[2] > PLACE_M:
+            return False
+        return math.dist(end[:2], self._centre(place)) <= (PLACE_M if self.capacity[place] == 1 else SIDE_M)
+
+    def _spots(self, place: str, size: Size, count: int) -> Iterable[Flat]:
+        """Yield spots to stand at a place: its centre, then round it."""
+        x, y = self._centre(place)
+        yield x, y
+        ring = 2 * size.kept_m + 3 * APART_M  # a robot arrives within some centimetres
+        angles = [math.tau * turn / 6 for turn in range(6)]
+        round_it = [(round(x + ring * math.sin(each), 3), round(y + ring * math.cos(each), 3)) for each in angles]
+        yield from [spot for spot in round_it if self._open(spot, size)][: count - 1]
+
+    def _open(self, spot: Flat, size: Size) -> bool:
+        fence = self.site.fence
+        if fence is not None and not (
+            fence.x[0] + size.radius_m <= spot[0] <= fence.x[1] - size.radius_m
+            and fence.y[0] + size.radius_m <= spot[1] <= fence.y[1] - size.radius_m
+        ):
+            return False
+        return not any(wall.grown(size.kept_m).holds(spot) for wall in self._closed)
+
+    # --- ways -------------------------------------------------------------------------------------------------
+
+    def _route(
+        self, me: Body, points: Sequence[Point], walls: Sequence[paths.Rectangle], flies: bool
+    ) -> tuple[Point, ...] | None:
+        """Return a way through points, round robots; a point that a robot is at is left out, but for the last."""
+        kept = me.size.kept_m
+        near = [wall.grown(min(kept, 0.9 * wall.gap(me.at[:2]))) for wall in walls]
+        map_walls = self._forbidden if flies else self._closed
+        if any(wall.gap(points[-1][:2]) < 0.8 * kept for wall in walls):
+            return None
+        way: list[Point] = [me.at]
+        for number, point in enumerate(points):
+            if number < len(points) - 1 and any(wall.holds(point[:2]) for wall in near):
+                continue
+            if paths.free(way[-1][:2], point[:2], near) and paths.free(way[-1][:2], point[:2], map_walls):
+                way.append(point)
+                continue
+            try:
+                leg = self._plan(way[-1][:2], point[:2], walls, flies=flies, kept_m=kept)
+            except paths.NoPath:
+                return None
+            way += [(round(x, 3), round(y, 3), point[2]) for x, y in leg]
+        return tuple(way)
+
+    def _plan(
+        self, start: Flat, goal: Flat, walls: Sequence[paths.Rectangle], *, flies: bool, kept_m: float
+    ) -> list[Flat]:
+        try:
+            return paths.plan(start, goal, [*self._closed, *walls], clearance=kept_m, tries=1)
+        except paths.NoPath:
+            if not flies:
+                raise
+            return paths.plan(start, goal, [*self._forbidden, *walls], clearance=kept_m, tries=1)
+
+    def _round(
+        self, me: Body, points: Sequence[Point], walls: Sequence[paths.Rectangle], avoid: Sequence[Body], trip: Trip
+    ) -> tuple[Point, ...] | None:
+        """Return a way round those that have reserved theirs; None where there is none, or it is too long."""
+        theirs = [wall for each in avoid if each.state is not None for wall in _walls_along(each.state.way, each.size)]
+        way = self._route(me, points, (*walls, *theirs), trip.flies)
+        shortest = geometry.length((me.at, *points))
+        longest = min(DETOUR * shortest, shortest + DETOUR_M) + 2 * me.size.kept_m
+        return way if way is not None and geometry.length(way) <= longest else None
+
+    # --- giving way -------------------------------------------------------------------------------------------
+
+    def gives_way(self, trip: Trip, wait: Wait, bodies: Mapping[str, Body]) -> bool:
+        """Whether a waiting robot is to give way: another waits for it, and of a ring it is the one to."""
+        if not any(each.waiting and each.waiting.waits_for == trip.robot for each in bodies.values()):
+            return False
+        ring = _ring(trip.robot, wait.robot, bodies)
+        rivals = [state for each in ring if (state := bodies[each].waiting) is not None and not state.stuck]
+        return not any((each.ticket, each.robot) > (trip.ticket, trip.robot) for each in rivals)
+
+    def refuges(self, trip: Trip, bodies: Mapping[str, Body]) -> Iterable[Go]:
+        """Yield ways to spots where a robot stands in nobody's way, the nearest first."""
+        me = bodies[trip.robot]
+        others = [each for each in bodies.values() if each.robot != trip.robot and _meet(me, trip, each)]
+        kept = me.size.kept_m
+        looked = 0
+        reach = int(REFUGE_M)
+        offsets = sorted(
+            ((dx, dy) for dx in range(-reach, reach + 1) for dy in range(-reach, reach + 1) if dx or dy),
+            key=lambda each: (math.hypot(*each), each),
+        )
+        walls = [wall for each in others if not each.moved and (wall := _wall(each, me)) is not None]
+        wants = [each for each in bodies.values() if each.waiting and each.robot != trip.robot]
+        for dx, dy in offsets:
+            spot = (me.at[0] + dx, me.at[1] + dy)
+            if not self._open(spot, me.size) or any(
+                math.dist(spot, self._centre(place)) < PLACE_M + kept for place in self.site.places
+            ):
+                continue
+            if any(math.dist(spot, each.at[:2]) < kept + each.size.kept_m + APART_M for each in others):
+                continue
+            if any(
+                each.state is not None
+                and len(each.state.way) > 1
+                and geometry.from_way(spot, each.state.way) < kept + each.size.kept_m
+                for each in (*wants, *(each for each in others if each.moved))
+            ):
+                continue
+            looked += 1
+            if looked > _REFUGES:
+                return
+            try:
+                leg = self._plan(me.at[:2], spot, walls, flies=trip.flies, kept_m=kept)
+            except paths.NoPath:
+                continue
+            way = (me.at, *((round(x, 3), round(y, 3), me.at[2]) for x, y in leg))
+            sweep = geometry.sweep(way, me.size)
+            yield Go(way=way, parts=frozenset[str]().union(*(cells for _, cells in sweep)), sweep=sweep, yields=True)
+
+
+def threat(way: Sequence[Point], me: Body, bodies: Iterable[Body]) -> Body | None:
+    """Return a robot that the one that moves would come too near to on the next stretch of its way.
+
+    Those that keep to reserved ways do not come so near; one that is too near already may be left.
+    """
+    for each in bodies:
+        if each.robot == me.robot or not _heights_meet(way, me.size, each):
+            continue
+        apart = min(me.size.radius_m + each.size.radius_m, math.dist(me.at[:2], each.at[:2]) - 0.05)
+        if geometry.from_way(each.at[:2], way) < apart:
+            return each
+    return None
+
+
+def next_ticket(bodies: Iterable[Body]) -> int:
+    """Return a ticket higher than all that are known."""
+    return 1 + max((each.state.ticket for each in bodies if each.state is not None), default=0)
+
+
+def usual_capacity(name: str, place: Place) -> int:
+    """Return how many robots a place takes of which the site file does not say it."""
+    words = {word for each in (name, *place.aliases) for word in each.split()}
+    return 1 if words.intersection(_SINGLE) else SEVERAL
+
+
+def _rectangle(box: Box) -> paths.Rectangle:
+    return paths.Rectangle(box.name, box.x[0], box.x[1], box.y[0], box.y[1])
+
+
+def _outside(fence: Box) -> Iterable[paths.Rectangle]:
+    """Yield what lies round a fence."""
+    (x0, x1), (y0, y1) = fence.x, fence.y
+    for x, y in (
+        ((x0 - OUTSIDE_M, x0), (y0 - OUTSIDE_M, y1 + OUTSIDE_M)),
+        ((x1, x1 + OUTSIDE_M), (y0 - OUTSIDE_M, y1 + OUTSIDE_M)),
+        ((x0, x1), (y0 - OUTSIDE_M, y0)),
+        ((x0, x1), (y1, y1 + OUTSIDE_M)),
+    ):
+        yield paths.Rectangle(fence.name, *x, *y)
+
+
+def _wall(body: Body, me: Body) -> paths.Rectangle | None:
+    """Return the ground that a robot keeps; of one that overlaps `me` so much that this one can leave."""
+    half = body.size.radius_m + (0.0 if body.stands else body.speed_mps * HAND_S)
+    off = max(abs(body.at[0] - me.at[0]), abs(body.at[1] - me.at[1]))
+    half = min(half, off - 0.01)
+    if half <= 0.02:
+        return None
+    x, y = body.at[:2]
+    return paths.Rectangle(body.robot, x - half, x + half, y - half, y + half)
+
+
+def _walls_along(way: Sequence[Point], size: Size) -> list[paths.Rectangle]:
+    """Return rectangles that cover a reserved way."""
+    walls: list[paths.Rectangle] = []
+    for start, end in pairwise(way):
+        pieces = max(1, math.ceil(min(abs(start[0] - end[0]), abs(start[1] - end[1]))))
+        for piece in range(pieces):
+            ends = [
+                [one + (piece + step) / pieces * (other - one) for one, other in zip(start, end, strict=True)]
+                for step in (0, 1)
+            ]
+            (x0, x1), (y0, y1) = (sorted(each[axis] for each in ends) for axis in (0, 1))
+            walls.append(paths.Rectangle("a reserved way", x0, x1, y0, y1).grown(size.kept_m))
+    return walls
+
+
+def _clear(way: Sequence[Point], body: Body, me: Body) -> bool:
+    """Whether a way keeps clear of a robot, or at least gets no nearer to one that is too near already."""
+    needed = me.size.kept_m + body.size.radius_m
+    return geometry.from_way(body.at[:2], way) >= min(needed, math.dist(me.at[:2], body.at[:2]) - 0.05)
+
+
+def _meet(me: Body, trip: Trip, body: Body) -> bool:
+    return _heights_meet((me.at, *trip.points), me.size, body)
+
+
+def _heights_meet(way: Sequence[Point], size: Size, body: Body) -> bool:
+    """Whether a robot is in a band of height that another goes through."""
+    heights = [each[2] for each in way]
+    low, high = geometry.bands(min(heights), max(heights), size)
+    theirs = [body.at[2], *(each[2] for each in body.state.way)] if body.moved and body.state else [body.at[2]]
+    other_low, other_high = geometry.bands(min(theirs), max(theirs), body.size)
+    return low <= other_high and other_low <= high
+
+
+def _leaves(body: Body | None, robot: str, place: str) -> str:
+    if body is not None and body.moved and body.state is not None and body.state.place == place:
+        return f"waits for {robot}, which goes to {place}"
+    return f"waits for {robot} to leave {place}{_itself(body)}"
+
+
+def _moves(body: Body) -> str:
+    if not body.stands:
+        return f"waits for {body.robot}, which moves without a reservation"
+    if not body.fresh:
+        return f"waits for {body.robot}, which is not heard of and was in the way"
+    return f"waits for {body.robot} to move out of the way{_itself(body)}"
+
+
+def _itself(body: Body | None) -> str:
+    if body is None or body.waiting is None or not body.waiting.waits_for:
+        return ""
+    return f" (it waits for {body.waiting.waits_for})"
+
+
+def _ring(robot: str, waits_for: str, bodies: Mapping[str, Body]) -> tuple[str, ...]:
+    """Return those that wait for one another in a ring with a robot, without itself; none where there is no ring."""
+    ring: list[str] = []
+    current = waits_for
+    while current != robot:
+        body = bodies.get(current)
+        if body is None or body.waiting is None or current in ring:
+            return ()
+        ring.append(current)
+        current = body.waiting.waits_for
+    return tuple(ring)
