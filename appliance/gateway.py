@@ -524,6 +524,7 @@ class Gateway:
             tasks=replace(self._robot_tasks.doors(), problems=problems),
             gate=self.authority.refuses,
             roster=self.plane.registry.robots,
+            keeps_ground=self._keeps_ground,
         )
         await self.hub.start()
         self._stack.push_async_callback(self.hub.stop)
@@ -533,6 +534,9 @@ class Gateway:
         rpc.register(keyspace.ROBOT_LINK_REMOVE, self.hub.remove_link)
         rpc.register(keyspace.ROBOT_FORGET, self.hub.forget)
         self._start_floor(site)
+
+    def _keeps_ground(self, robot: str) -> bool:
+        return self.floor.sight.knows(robot)
 
     def _start_floor(self, site: Site) -> None:
         config = self.config

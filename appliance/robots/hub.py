@@ -45,9 +45,12 @@ class RobotHub:
         tasks: Tasks | None = None,
         gate: Callable[[str, RobotCommand], str] = lambda _, __: "",
         roster: Mapping[str, RobotInfo] | None = None,
+        keeps_ground: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self._config = config
         self._roster: Mapping[str, RobotInfo] = {} if roster is None else roster
+        self._keeps_ground = keeps_ground
+        """Whether ground is kept for a robot of that name, which the roster may not have any more."""
         self._gate = gate
         self._session = session
         self._store = store
@@ -123,7 +126,7 @@ class RobotHub:
         name = ask.robot[:120]
         mine = name in self.attached
         known = self._roster.get(name)
-        if not mine and known is None:
+        if not mine and known is None and not self._keeps_ground(name):
             raise NotFoundError(f"no robot {name!r}", remedy="see `swiftbot robots`")
         if (known is not None and known.online) or (self._mavlink is not None and self._mavlink.vehicles.online(name)):
             raise RefusedError(f"{name} is online", remedy="switch it off, or remove its link, first")

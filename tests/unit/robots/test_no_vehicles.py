@@ -116,8 +116,9 @@ class Hub:
         wire: Any = Wire()
         wire.delete = self.deleted.append
         self.hub = RobotHub(
-            RobotsConfig(), session=wire, store=FakeStore(), gateway="gw-1", site=Site(), roster=self.roster
-        )
+            RobotsConfig(), session=wire, store=FakeStore(), gateway="gw-1", site=Site(), roster=self.roster,
+            keeps_ground=lambda robot: robot == "rover_9",
+        )  # fmt: skip
         self.hub._mavlink = made
 
 
@@ -143,6 +144,7 @@ async def test_a_robot_that_is_gone_can_be_forgotten() -> None:
         it.roster["rover_1"] = RobotInfo(id="rover_1", kind="zenoh", online=False)
         await it.hub.forget(RobotForget(robot="rover_1"))
         assert it.deleted[1:] == ["swiftbot/test/robot/rover_1/state"]
+        await it.hub.forget(RobotForget(robot="rover_9"))  # off the roster for long, but its ground is still kept
 
 
 async def test_a_deleted_row_is_gone_from_rosters() -> None:
