@@ -161,10 +161,11 @@ def log_layout(
 
     Write it to a file and choose "Import from file" among Foxglove's layouts.
     """
+    from appliance.model.keys import check_name
     from appliance.record.layout import layout
 
     del as_json  # a layout is JSON in any case
-    show(layout(where.fleet, recorder), as_json=True)
+    show(layout(where.fleet, check_name(recorder, "recorder")), as_json=True)
     return Exit.DONE
 
 

@@ -367,7 +367,7 @@ async def test_bad_input_is_answered(hall: Hall) -> None:
         hall.session.put(hall.session.keys(WORLD, "red_box"), payload)
     failure = (await hall.tell("rover_1", "teleport")).failure
     assert failure is not None
-    assert "it can: ask, capture, close, give, goto" in failure.remedy
+    assert "it can: ask, capture, clean, close, cut" in failure.remedy
     await hall.done("rover_1", "state")
 
 

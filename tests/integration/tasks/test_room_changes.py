@@ -21,7 +21,7 @@ def test_few_changes_of_room_from_submit_to_result(podman: Path, project_root: P
     found = json.loads(traced.stdout[traced.stdout.index("{\n") :])
     assert found["state"] == "succeeded"
     entered = [visit["room"] for visit in found["visits"] if not visit["returned"]]
-    assert {"llm", "pool", "robots", "tasks", "plane"} == set(entered)
+    assert {"floor", "llm", "pool", "robots", "tasks", "plane"} == set(entered)
     assert len(entered) - 1 == found["changes"]
     command = "tasks robots plane"
     assert len(" ".join(entered).replace(f"{command} {command}", command).split()) - 1 <= 16, entered

@@ -1,13 +1,12 @@
 """The paper's evaluation as one command."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from appliance import console
 from appliance.cli.common import Json
-from workshop.bench.paper.steps import Size
 from workshop.cli.bench.common import bench_app, measure, say, tell
 
 
@@ -16,7 +15,8 @@ def paper(
     *,
     out: Annotated[Path, Parameter(help="Folder of the report and of its data; begun again it goes on there.")],
     size: Annotated[
-        Size, Parameter(help="smoke shows that all of it works (minutes), short is meant for an hour, full for a day.")
+        Literal["smoke", "short", "full"],
+        Parameter(help="smoke shows that all of it works (minutes), short is meant for an hour, full for a day."),
     ] = "short",
     again: Annotated[bool, Parameter(negative="", help="Measure what is there already, too.")] = False,
     show: Annotated[bool, Parameter(negative="", help="Measure nothing: draw what is there.")] = False,
