@@ -2,18 +2,27 @@
 
 import os
 import uuid
+from collections.abc import Callable
+from typing import TypeVar
 
 from . import params
 from .context import Context
 
 VOLUME = "baselines"
 
+T = TypeVar("T")
 
-def last(ctx: Context, name: str) -> bytes | None:
-    """Return what was kept under a name, None when nothing was."""
+
+def last(ctx: Context, name: str, read: Callable[[bytes], T]) -> T | None:
+    """Return what was kept under a name as `read` understands it; None when nothing was, or it is damaged (logged)."""
     try:
-        return (ctx.volume(VOLUME) / params.slug(name)).read_bytes()
+        data = (ctx.volume(VOLUME) / params.slug(name)).read_bytes()
     except FileNotFoundError:
+        return None
+    try:
+        return read(data)
+    except Exception as error:  # noqa: BLE001 - whatever is wrong with the file, the next comparison must not fail for it
+        ctx.log(f"what was kept as {name} cannot be read and is replaced", reason=str(error), bytes=len(data))
         return None
 
 

@@ -3,9 +3,9 @@
 With `baseline`, the first comparison keeps what it got under that name, and later ones hold theirs against it.
 """
 
-import json
+from functools import partial
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 from _lib import baselines, changes, params, pictures
 from _lib.context import Context
@@ -59,22 +59,26 @@ def _with_baseline(
     compared = 0
     if images:
         now = changes.small(ctx, ctx.get_artifact(images[-1]), "the picture")
-        before = baselines.last(ctx, f"picture {baseline}")
+        before = baselines.last(ctx, f"picture {baseline}", partial(changes.small, ctx, name=baseline))
         if before is None:
             baselines.keep(ctx, f"picture {baseline}", changes.png(now))
             findings.append({"kind": "baseline", "text": f"this picture is the baseline {baseline} from now on"})
         else:
             compared += 1
-            _say_change(findings, f"from {baseline}", changes.between(changes.small(ctx, before, baseline), now))
+            _say_change(findings, f"from {baseline}", changes.between(before, now))
     if numbers:
-        kept = baselines.last(ctx, f"number {baseline}")
+        kept = baselines.last(ctx, f"number {baseline}", _number)
         if kept is None:
-            baselines.keep(ctx, f"number {baseline}", json.dumps(numbers[-1][1]).encode())
+            baselines.keep(ctx, f"number {baseline}", repr(numbers[-1][1]).encode())
             findings.append({"kind": "baseline", "text": f"this number is the baseline {baseline} from now on"})
         else:
             compared += 1
-            findings.append(_difference(f"from {baseline}", float(cast("float", json.loads(kept))), numbers[-1][1]))
+            findings.append(_difference(f"from {baseline}", kept, numbers[-1][1]))
     return compared
+
+
+def _number(data: bytes) -> float:
+    return float(data)
 
 
 def _say_change(findings: list[dict[str, Any]], what: str, change: dict[str, Any]) -> None:

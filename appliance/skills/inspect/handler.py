@@ -4,6 +4,7 @@ It has no detector of defects: it says what differs from the last inspection and
 warning lamps are, for a person to look at. The picture is then what the next inspection is compared with.
 """
 
+from functools import partial
 from typing import Any
 
 from _lib import baselines, changes, colours, params, pictures
@@ -32,9 +33,9 @@ def run(ctx: Context) -> dict[str, Any]:
         for row in colours.detections(picture, "things", ctx.site)
     ]
     name = f"inspect {asset}"
-    before = baselines.last(ctx, name) if judged else None
+    before = baselines.last(ctx, name, partial(changes.small, ctx, name=asset)) if judged else None
     if before is not None:
-        change = changes.between(now, changes.small(ctx, before, f"the last picture of {asset}"))
+        change = changes.between(now, before)
         if change["boxes"]:
             share = 100 * change["changed_share"]
             findings.append({"kind": "changed", "text": f"{share:.0f} % differs from the last inspection", **change})

@@ -45,6 +45,21 @@ def test_a_dark_picture_judges_nothing_and_is_no_baseline(make_ctx: Make, handle
     assert kinds(handler("inspect").run(ctx)) == []
 
 
+def test_a_damaged_baseline_is_replaced_and_said(make_ctx: Make, handler: Load, picture: Draw) -> None:
+    """A disk's damage does not end every later inspection: the log has it, and the next one is the baseline."""
+    ctx = make_ctx(asset="pump", baseline="monday")
+    ctx.inputs["n"] = {"number": 4}
+    with_picture(ctx, picture(RED))
+    for skill in ("inspect", "compare"):
+        handler(skill).run(ctx)
+    for file in ctx.volume("baselines").iterdir():
+        file.write_bytes(b"\x00damaged")
+    assert not handler("inspect").run(ctx)["compared"]
+    assert kinds(handler("compare").run(ctx)) == ["baseline", "baseline"]
+    assert len(ctx.logged) == 3
+    assert handler("inspect").run(ctx)["compared"]
+
+
 def test_compare_holds_results_against_each_other(make_ctx: Make, handler: Load, picture: Draw) -> None:
     """Pictures and numbers, each with the one before; what is alike is no finding."""
     ctx = make_ctx()
