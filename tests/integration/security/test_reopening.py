@@ -163,7 +163,8 @@ async def test_a_stop_does_not_wait_for_the_session_to_be_reopened(
     done, order = asyncio.Event(), list[str]()
 
     async def slow(_: str, payload: bytes) -> bytes:
-        await done.wait()
+        if payload != b"ready":
+            await done.wait()
         return payload
 
     async def robot(_: str, payload: bytes) -> bytes:
@@ -176,11 +177,17 @@ async def test_a_stop_does_not_wait_for_the_session_to_be_reopened(
 
     other.session.serve(KEYS(keyspace.COMMAND, "r2"), slow)
     other.session.serve(KEYS(keyspace.COMMAND, "r1"), robot)
+    state = encode(RobotCommand(id="1", verb="state"))
+    for key, payload in ((KEYS(keyspace.COMMAND, "r1"), state), (KEYS(keyspace.COMMAND, "r2"), b"ready")):
+        while True:  # what a session serves is known to the other a moment later
+            with contextlib.suppress(UnreachableError):
+                await one.session.query(key, payload, timeout_s=30.0)
+                break
+            await asyncio.sleep(0.01)
     work = [asyncio.create_task(follow("slow", one.session.query(KEYS(keyspace.COMMAND, "r2"), b"", timeout_s=30.0)))]
     await asyncio.sleep(0)
     work.append(asyncio.create_task(follow("reopened", one._reopener.reopen("a test"))))
     await until(lambda: one.session._wire.held)
-    state = encode(RobotCommand(id="1", verb="state"))
     work.append(
         asyncio.create_task(follow("state", one.session.query(KEYS(keyspace.COMMAND, "r1"), state, timeout_s=30.0)))
     )
