@@ -76,7 +76,7 @@ async def test_seen_clicked_and_stopped_in_a_browser(small: FleetState, address:
         before = await page.picture()
         assert colours(before) > 50, "nothing but the ground is to be seen"
 
-        # The third name of the second line, by the measures of the terminal: cells, and the box they are in.
+        # "Robots" in the second line, by the measures of the terminal: cells, and the box they are in.
         heard = len(page.received)
         sizes = [said[1] for each in page.sent if (said := json.loads(each))[0] == "resize"]
         left, top, width, height = await page.value(
@@ -84,7 +84,7 @@ async def test_seen_clicked_and_stopped_in_a_browser(small: FleetState, address:
             " return [box.left, box.top, box.width, box.height]; })()"
         )
         cell, line = width / sizes[-1]["width"], height / sizes[-1]["height"]
-        await page.click(left + 22.5 * cell, top + 1.5 * line)
+        await page.click(left + 33.5 * cell, top + 1.5 * line)
         await page.gets("N↑", "rover_1", after=heard)
         after = await page.picture()
         assert after != before
