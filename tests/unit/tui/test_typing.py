@@ -77,8 +77,8 @@ async def test_every_screen_can_be_left_by_its_keys(view: "FakeView") -> None:
     app = SwiftbotApp(view)
     async with app.run_test(size=(80, 24)) as pilot:
         seen: list[str] = []
-        for key in "1234567812":
+        for key in "0123456780":
             await pilot.press(key)
             await pilot.pause(0.1)
             seen.append(app.current_mode)
-        assert seen == [*SCREENS, *list(SCREENS)[:2]]
+        assert seen == [*SCREENS, next(iter(SCREENS))]
