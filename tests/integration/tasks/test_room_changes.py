@@ -1,6 +1,7 @@
 """The path of an instruction through a gateway stays short."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -23,5 +24,6 @@ def test_few_changes_of_room_from_submit_to_result(podman: Path, project_root: P
     entered = [visit["room"] for visit in found["visits"] if not visit["returned"]]
     assert {"floor", "llm", "pool", "robots", "tasks", "plane"} == set(entered)
     assert len(entered) - 1 == found["changes"]
-    command = "tasks robots plane"
-    assert len(" ".join(entered).replace(f"{command} {command}", command).split()) - 1 <= 16, entered
+    command = "tasks floor tasks robots plane"  # asked once more where the robot still carries it out
+    once = re.sub(rf"{command}( plane)*( tasks)? (floor tasks robots plane)", command, " ".join(entered))
+    assert len(once.split()) - 1 <= 16, entered
