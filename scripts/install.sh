@@ -4,7 +4,7 @@
 #
 #   /opt/swiftbot/releases/ID              the program (from locks/gateway.txt), its units and its page
 #   /opt/swiftbot/current, previous        links to the release that runs and the one before
-#   /usr/local/lib/systemd, sysusers.d, tmpfiles.d, /usr/local/bin/swiftbot    links into `current`
+#   /usr/local/lib/systemd, sysusers.d, tmpfiles.d, /usr/local/bin/swiftbot, /usr/local/share/man    links into `current`
 #   /etc/swiftbot/gateway.toml             only where there is none yet
 #
 # A release is laid out beside the others and switched to by one rename: killed or without power at any moment, this leaves
@@ -68,6 +68,7 @@ if [ -z "${WITHOUT_ENVIRONMENT:-}" ]; then
   "$uv" pip sync --quiet --require-hashes --compile-bytecode --python "$staged/venv/bin/python" "$PROJECT/locks/$lock.txt" ||
     die "the packages of locks/$lock.txt" "see the lines above; network, proxy and certificates are the usual reasons"
   "$uv" pip install --quiet --no-deps --no-index --compile-bytecode --python "$staged/venv/bin/python" "$wheels"/*.whl
+  "$staged/venv/bin/swiftbot" manual "$staged/man" || die "the manual pages" "see the lines above"
 fi
 
 say "release and units"

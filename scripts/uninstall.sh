@@ -39,7 +39,8 @@ say "units and program"
 # Links into the release that runs, and the files that installations before releases have left there.
 for unit in "${UNITS[@]}"; do rm -f "$LIB/systemd/system/$unit"; done
 rm -f "$LIB/systemd/system-generators/swiftbot-generator" "$LIB/sysusers.d/swiftbot.conf" "$LIB/tmpfiles.d/swiftbot.conf"
-for place in "$LIB"/systemd/system "$LIB"/systemd/system-generators "$LIB"/sysusers.d "$LIB"/tmpfiles.d "$DESTDIR"/usr/local/bin; do
+for place in "$LIB"/systemd/system "$LIB"/systemd/system-generators "$LIB"/sysusers.d "$LIB"/tmpfiles.d "$DESTDIR"/usr/local/bin \
+  "$DESTDIR"/usr/local/share/man/man1; do
   if [ -d "$place" ]; then find "$place" -maxdepth 1 -type l -lname '*opt/swiftbot/*' -delete; fi
 done
 rm -rf "$DESTDIR/opt/swiftbot"

@@ -60,7 +60,7 @@ def actions() -> str:
 
 def screens() -> str:
     """The screens with their keys."""
-    rows = [(f"`{number}`", title, shows) for number, (title, shows) in enumerate(SCREENS.values(), start=1)]
+    rows = [(f"`{number}`", title, shows) for number, (title, shows) in enumerate(SCREENS.values())]
     return _table(("key", "screen", "what it shows"), rows)
 
 

@@ -26,6 +26,7 @@ from appliance.cli import (
     learn,
     llm,
     log,
+    manual,
     mcp,
     parts,
     place,
@@ -81,6 +82,7 @@ for noun in (
     backup,
     doctor,
     completion,
+    manual,
 ):
     noun.add_to(app)
 add_operations(app)

@@ -26,14 +26,16 @@ from appliance import durable
 from appliance.errors import ConfigError, NotFoundError, SwiftbotError
 
 PREFIX = "opt/swiftbot"
-LIB = "usr/local/lib"
+LOCAL = "usr/local"
+UNIT_FOLDER = "lib/systemd/system"
 PLACES = {
-    "systemd/system": "systemd/*.*",
-    "systemd/system-generators": "systemd/system-generators/*",
-    "sysusers.d": "systemd/sysusers.d/*.conf",
-    "tmpfiles.d": "systemd/tmpfiles.d/*.conf",
+    UNIT_FOLDER: "systemd/*.*",
+    "lib/systemd/system-generators": "systemd/system-generators/*",
+    "lib/sysusers.d": "systemd/sysusers.d/*.conf",
+    "lib/tmpfiles.d": "systemd/tmpfiles.d/*.conf",
+    "share/man/man1": "man/*.1",
 }
-"""Folder below LIB: which files of a release are linked there."""
+"""Folder below LOCAL: which files of a release are linked there."""
 UNITS = (".service", ".socket", ".mount", ".timer", ".target")
 COMMAND = "usr/local/bin/swiftbot"
 KEPT = 3
@@ -138,8 +140,8 @@ class Layout:
         folder = self.folder(release)
         for place, pattern in PLACES.items():
             for file in sorted(folder.glob(pattern)):
-                if file.is_file() and (place != "systemd/system" or file.suffix in UNITS):
-                    yield self.root / LIB / place / file.name, self.current / file.relative_to(folder)
+                if file.is_file() and (place != UNIT_FOLDER or file.suffix in UNITS):
+                    yield self.root / LOCAL / place / file.name, self.current / file.relative_to(folder)
         if (folder / "venv/bin/swiftbot").exists():
             yield self.root / COMMAND, self.current / "venv/bin/swiftbot"
 
@@ -157,7 +159,7 @@ class Layout:
 
     def links(self) -> list[Path]:
         """Return the links into `current` that there are."""
-        folders = (*(self.root / LIB / place for place in PLACES), (self.root / COMMAND).parent)
+        folders = (*(self.root / LOCAL / place for place in PLACES), (self.root / COMMAND).parent)
         at = self.prefix.resolve() / self.current.name
         return [
             link

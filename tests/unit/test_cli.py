@@ -22,7 +22,7 @@ def leaves(parent: App, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 COMMANDS = dict(leaves(cli.app))
 SILENT = {
     "tui", "gateway", "router", "record", "foxglove", "mcp", "up", "demo", "sim mavlink", "sim zenoh", "train fit",
-    "train export", "train tune", "robots qgc-actions", "robots drive", "completion",
+    "train export", "train tune", "robots qgc-actions", "robots drive", "completion", "manual",
 }  # fmt: skip
 """Commands that print no data of their own, or a file as it is."""
 NEGATIVE = {"--no-clock", "--no-ray", "--no-profile", "--no-record", "--no-plain"}
