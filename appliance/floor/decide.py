@@ -6,9 +6,11 @@ Rules, in the order in which they are looked at:
    lower ticket goes first. Robots of one task may share a place, side by side: its plan has ordered them.
 2. A robot that stands keeps the ground under it, whether it has a task or not. Ways lead round it where there is room.
    One that moves without a reservation (by hand, by a pilot, unknown) has the ground that it can reach in `HAND_S` too.
-3. A way is reserved as a whole before its robot moves, and freed behind it (`geometry.cells`). Who is refused looks for
-   a way round the one that has it; where that is too long, it waits. The way of the one that has waited longest of all,
-   for `PATIENCE_S` or more, is reserved by nobody else any more.
+3. A way is reserved before its robot moves, and freed behind it (`geometry.cells`). Where others move or want to on it,
+   it is cut into stretches: each ends where the robot stands in nobody's way, about `STRETCH_M` further on or behind
+   what it would block, and is reserved as a whole, so that a robot never stops in an aisle that another wants to pass.
+   Who is refused goes up to the part that another has, or looks for a way round the one that has it, or waits. The way
+   of the one that has waited longest of all, for `PATIENCE_S` or more, is reserved by nobody else any more.
 4. A robot that waits and stands in the way of another that waits for it gives way: it goes to the nearest spot that is
    in nobody's way. Where they wait for one another, in a ring of any length, only the one with the highest ticket does,
    of those that have such a spot.
@@ -19,6 +21,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from appliance.floor import geometry
 from appliance.floor.geometry import Flat, Size
@@ -41,6 +44,10 @@ APART_M = 0.1
 """Between robots side by side, beside their margins."""
 DETOUR, DETOUR_M = 1.6, 4.0
 """A way round a robot that moves is taken when it is at most so many times, and metres, longer."""
+STRETCH_M = 10.0
+"""So much of a way is reserved at a time, where a robot can stop so early in nobody's way."""
+SHORTEST_M = 2.0
+"""A robot does not set off for less, nor stop for less before the end."""
 YIELD_S = 2.0
 """How long robots stand in each other's way before one gives way."""
 REFUGE_M = 14.0
@@ -101,6 +108,13 @@ class Go(Struct, frozen=True, kw_only=True):
     place: str = ""
     yields: bool = False
     """It gives way: the way does not end where the command ends."""
+    wants: tuple[Point, ...] = ()
+    """Where the robot goes on to: the way is one stretch only."""
+
+    @property
+    def ends(self) -> bool:
+        """Whether the way ends where the command ends."""
+        return not self.yields and not self.wants
 
 
 class Wait(Struct, frozen=True, kw_only=True):
@@ -149,6 +163,10 @@ class Floor:
             trip: where to.
             bodies: all robots that are seen, its own among them.
             avoid: robots that have the shortest way reserved: look for one round theirs.
+
+        Returns:
+            Go: the first stretch of the way, or all of it.
+            Wait: whom it waits for.
         """
         me = bodies[trip.robot]
         others = [each for each in bodies.values() if each.robot != trip.robot and _meet(me, trip, each)]
@@ -176,15 +194,64 @@ class Floor:
         if way is None:
             nearest = min(standing, key=lambda each: geometry.from_way(each.at[:2], straight))
             return Wait(robot=nearest.robot, why=_moves(nearest), place=place, way=straight)
-        sweep = geometry.sweep(way, me.size)
-        parts = frozenset[str]().union(*(cells for _, cells in sweep))
-        first = self._patient(trip, me, others, parts)
+        whole = _go(way, me.size, place=place)
+        if place and self.capacity[place] == 1 and goal[:2] == self._centre(place):
+            whole = replace(whole, parts=whole.parts | {f"place/{place}"})
+        step = self._stretch(whole, trip, me, others)
+        first = self._patient(trip, me, others, step.parts)
         if first is not None:
             # It is not in the way: nobody has to give way for that.
             return Wait(robot="", why=f"waits for {first}, which has waited longer", place=place, way=way)
-        if place and self.capacity[place] == 1 and goal[:2] == self._centre(place):
-            parts |= {f"place/{place}"}
-        return Go(way=way, parts=parts, sweep=sweep, place=place)
+        return step
+
+    # --- stretches --------------------------------------------------------------------------------------------
+
+    def up_to(self, go: Go, part: str, trip: Trip, bodies: Mapping[str, Body]) -> Go | None:
+        """Return the stretch of a way that ends before a part that another has; None where there is none."""
+        me = bodies[trip.robot]
+        others = [each for each in bodies.values() if each.robot != trip.robot and _meet(me, trip, each)]
+        ends = [end for end, cells in go.sweep if part in cells]
+        if trip.flies or trip.fixed or go.yields or not ends:
+            return None
+        spots = [each for each in self._stops(go, me, others) if each < ends[0]]
+        return _cut(go, spots[-1], me.size) if spots else None
+
+    def _stretch(self, go: Go, trip: Trip, me: Body, others: Sequence[Body]) -> Go:
+        """Return what of a way is reserved at first: all of it where nobody else wants to pass."""
+        if trip.flies or trip.fixed or geometry.length(go.way) <= STRETCH_M:
+            return go
+        near = [
+            wanted
+            for each in others
+            if (wanted := _wanted(each)) and geometry.ways_meet(go.way, wanted, me.size.kept_m + each.size.kept_m)
+        ]
+        spots = self._stops(go, me, others) if near else []
+        if not spots:
+            return go
+        early = [each for each in spots if each <= STRETCH_M]
+        return _cut(go, early[-1] if early else spots[0], me.size)
+
+    def _stops(self, go: Go, me: Body, others: Sequence[Body]) -> list[float]:
+        """Return how far along a way its robot can stop in nobody's way and at nobody's place, metres."""
+        last = geometry.length(go.way) - SHORTEST_M
+        found: list[float] = []
+        for end, _ in go.sweep:
+            if SHORTEST_M <= end <= last and self._in_nobodys_way(geometry.ahead(go.way, end)[-1][:2], me, others):
+                found.append(end)
+        return found
+
+    def _in_nobodys_way(self, spot: Flat, me: Body, others: Sequence[Body]) -> bool:
+        kept = me.size.kept_m
+        if any(math.dist(spot, self._centre(place)) < PLACE_M + 2 * kept for place in self.site.places):
+            return False
+        for each in others:
+            apart = kept + each.size.kept_m + APART_M
+            if math.dist(spot, each.at[:2]) < apart:
+                return False
+            wanted = _wanted(each)
+            if wanted and geometry.from_way(spot, wanted) < apart:
+                return False
+        return True
 
     def _patient(self, trip: Trip, me: Body, others: Sequence[Body], parts: frozenset[str]) -> str | None:
         """Return the robot that has waited longest of all, too long, and would have to wait for this one too."""
@@ -365,9 +432,7 @@ class Floor:
             if any(math.dist(spot, each.at[:2]) < kept + each.size.kept_m + APART_M for each in others):
                 continue
             if any(
-                each.state is not None
-                and len(each.state.way) > 1
-                and geometry.from_way(spot, each.state.way) < kept + each.size.kept_m
+                (wanted := _wanted(each)) and geometry.from_way(spot, wanted) < kept + each.size.kept_m
                 for each in (*wants, *(each for each in others if each.moved))
             ):
                 continue
@@ -379,8 +444,7 @@ class Floor:
             except paths.NoPath:
                 continue
             way = (me.at, *((round(x, 3), round(y, 3), me.at[2]) for x, y in leg))
-            sweep = geometry.sweep(way, me.size)
-            yield Go(way=way, parts=frozenset[str]().union(*(cells for _, cells in sweep)), sweep=sweep, yields=True)
+            yield replace(_go(way, me.size), yields=True)
 
 
 def threat(way: Sequence[Point], me: Body, bodies: Iterable[Body]) -> Body | None:
@@ -395,6 +459,26 @@ def threat(way: Sequence[Point], me: Body, bodies: Iterable[Body]) -> Body | Non
         if geometry.from_way(each.at[:2], way) < apart:
             return each
     return None
+
+
+def _go(way: tuple[Point, ...], size: Size, *, place: str = "") -> Go:
+    sweep = geometry.sweep(way, size)
+    return Go(way=way, parts=frozenset[str]().union(*(cells for _, cells in sweep)), sweep=sweep, place=place)
+
+
+def _cut(go: Go, metres: float, size: Size) -> Go:
+    """Return the first stretch of a way; the place at its end is reserved with the last one."""
+    way = geometry.ahead(go.way, metres)
+    # `ahead` ends with a point of its own, on the leg to this one.
+    return replace(_go(way, size, place=go.place), wants=(*go.way[len(way) - 1 :], *go.wants))
+
+
+def _wanted(body: Body) -> tuple[Point, ...]:
+    """Return the way that a robot is on, or waits for, with what comes after."""
+    state = body.state
+    if state is None or state.state == "stands" or len(state.way) < 2:
+        return ()
+    return (*state.way, *state.wants) if body.moved else state.way
 
 
 def next_ticket(bodies: Iterable[Body]) -> int:

@@ -121,6 +121,31 @@ def from_way(point: Flat, way: Sequence[Point]) -> float:
     return min(from_line(point, start[:2], end[:2]) for start, end in pairwise(way))
 
 
+def ways_meet(one: Sequence[Point], other: Sequence[Point], apart: float) -> bool:
+    """Whether two ways come nearer to each other than that, on the ground."""
+    for start, end in pairwise(one):
+        for first, last in pairwise(other):
+            if _cross(start[:2], end[:2], first[:2], last[:2]):
+                return True
+            gaps = (
+                from_line(start[:2], first[:2], last[:2]),
+                from_line(end[:2], first[:2], last[:2]),
+                from_line(first[:2], start[:2], end[:2]),
+                from_line(last[:2], start[:2], end[:2]),
+            )
+            if min(gaps) < apart:
+                return True
+    return False
+
+
+def _cross(start: Flat, end: Flat, first: Flat, last: Flat) -> bool:
+    def side(one: Flat, other: Flat, point: Flat) -> float:
+        return (other[0] - one[0]) * (point[1] - one[1]) - (other[1] - one[1]) * (point[0] - one[0])
+
+    apart = side(start, end, first) * side(start, end, last) < 0.0
+    return apart and side(first, last, start) * side(first, last, end) < 0.0
+
+
 def length(way: Sequence[Point]) -> float:
     """Metres along a way."""
     return sum(math.dist(start, end) for start, end in pairwise(way))

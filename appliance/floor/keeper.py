@@ -6,6 +6,7 @@ the robot has. Reservations end when nobody renews them, and stand in the way un
 """
 
 import asyncio
+import math
 import time
 from collections.abc import Awaitable, Callable
 
@@ -15,13 +16,13 @@ from msgspec.structs import replace
 from appliance.background import Background
 from appliance.errors import RobotError, SwiftbotError
 from appliance.floor import geometry
-from appliance.floor.decide import Body, Floor, Go, Trip, Wait
+from appliance.floor.decide import PLACE_M, Body, Floor, Go, Trip, Wait
 from appliance.floor.mover import Mover
 from appliance.floor.settings import FloorConfig
 from appliance.floor.sight import Sight
 from appliance.floor.trips import goto_args, trip_of
 from appliance.model import RobotCommand, RobotReply, Site, keyspace
-from appliance.model.floor import FloorState
+from appliance.model.floor import FloorState, Point
 from appliance.model.plane_api import MOST_PARTS
 from appliance.plane.leases import Claim, Lease
 from appliance.plane.node import Plane
@@ -42,6 +43,8 @@ NOTE_S = 5.0
 """How often a run says again what it waits for."""
 STOP_S = 15.0
 """How long a robot may take to stand once it was stopped."""
+AT_M = 0.15
+"""A robot that is seen so near to the end of a stretch has arrived there."""
 _LAST_S = 1.5
 """A robot is stopped so long before its reservation ends."""
 
@@ -277,7 +280,7 @@ class _Drive:
         self._mover = Mover(keeper.floor, trip)
         self._lease: Lease | None = None
         self._trip = trip
-        self._sent = self._yields = 0
+        self._sent = self._yields = self._stretches = 0
         self._joins: str | None = None
         """Id of the command that its robot was on already."""
         self._waited_s = 0.0
@@ -295,7 +298,7 @@ class _Drive:
                 if self._noted:
                     self._note("goes on its way")
                 reply = await self._go(step)
-                if reply is None or (step.yields and reply.failure is None):
+                if reply is None or (not step.ends and reply.failure is None):
                     continue
                 if self._command.verb != "return_home" or self._mover.trip.fixed or reply.failure is not None:
                     return reply
@@ -340,7 +343,7 @@ class _Drive:
             return Wait(robot="", why=f"waits for {robot}: it does {other.trip.command}")
         if body.moved and body.state is not None and not self._same(body.state):
             return Wait(robot="", why=f"waits for {robot}: it does {body.state.command}")
-        if self._command.attempt > 1 and not self._sent and not body.stands:
+        if self._command.attempt > 1 and not self._begun and not body.stands:
             return Wait(robot="", why=f"waits for {robot} to stand still")
         return None
 
@@ -377,13 +380,23 @@ class _Drive:
 
     # --- going ------------------------------------------------------------------------------------------------
 
+    @property
+    def _begun(self) -> bool:
+        """Whether this run has moved the robot."""
+        return bool(self._sent or self._yields or self._stretches)
+
     def _joined(self) -> Go | None:
         """Return the way of a robot that is on it already: another gateway's run, or this one's before a restart."""
-        if self._joins is not None or self._sent or self._command.attempt <= 1:
+        if self._joins is not None or self._begun or self._command.attempt <= 1:
             return None
         floor, body = self._keeper.floor, self._body()
         state = body.state
-        if state is None or not body.moved or not self._same(state) or len(state.way) < 2 or body.stands:
+        if state is None or not self._same(state) or len(state.way) < 2:
+            return None
+        joins = body.moved and not body.stands
+        if state.wants and not self._trip.fixed and (joins or math.dist(body.at, state.way[-1]) <= PLACE_M):
+            self._mover.goes_on(state.wants)
+        if not joins:
             return None
         self._joins = state.command
         way = (body.at, *geometry.still_to_go(state.way, body.at[:2]))
@@ -391,7 +404,8 @@ class _Drive:
         parts = frozenset[str]().union(*(cells for _, cells in sweep))
         if floor.capacity.get(state.place) == 1:
             parts |= {f"place/{state.place}"}
-        return Go(way=way, parts=parts, sweep=sweep, place=state.place, yields="~y" in state.command)
+        yields = "~y" in state.command
+        return Go(way=way, parts=parts, sweep=sweep, place=state.place, yields=yields, wants=state.wants)
 
     async def _take_over(self, go: Go) -> Go | Wait:
         """Keep the way of a robot that is on it."""
@@ -420,6 +434,9 @@ class _Drive:
         if go.yields:
             self._yields += 1
             return replace(goto, id=f"{command.id}~y{self._yields}")
+        if go.wants:
+            self._stretches += 1
+            return replace(goto, id=f"{command.id}~p{command.attempt}.{self._stretches}")
         self._sent += 1
         if command.verb == "return_home":
             return replace(goto, id=f"{command.id}~h{self._sent}")
@@ -438,6 +455,8 @@ class _Drive:
                 await asyncio.wait({sending, keeping}, timeout=WATCH_S, return_when=asyncio.FIRST_COMPLETED)
                 if sending.done():
                     reply = sending.result()
+                    if not go.ends and reply.failure is None:
+                        await self._until_it_is_at(go.way[-1])
                     mover.arrived()
                     await self._stand()
                     return reply
@@ -462,6 +481,14 @@ class _Drive:
         """Give up what is not needed any more; `_keep` is on its way no longer, or has nothing to do."""
         if self._lease is not None:
             await self._keeper.stand(self._body(), self._mover.place, self._lease)
+
+    async def _until_it_is_at(self, end: Point) -> None:
+        """Wait until a robot is seen where it says it is: its next way begins where it is seen."""
+        for _ in range(round(STOP_S / WATCH_S)):
+            body = self._body()
+            if body.stands or math.dist(body.at[:2], end[:2]) <= AT_M:
+                return
+            await asyncio.sleep(WATCH_S)
 
     async def _until_it_stands(self) -> None:
         for _ in range(round(STOP_S / WATCH_S)):

@@ -6,7 +6,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from appliance.floor import geometry
-from appliance.floor.decide import YIELD_S, Body, Floor, Go, Trip, Wait, next_ticket, threat
+from appliance.floor.decide import PATIENCE_S, YIELD_S, Body, Floor, Go, Trip, Wait, next_ticket, threat
 from appliance.model.floor import MOST_POINTS, FloorState, Point
 
 BEHIND_M = 0.3
@@ -59,6 +59,9 @@ class Mover:
         self, go: Go, holder: str, part: str, bodies: Mapping[str, Body], now: float, *, ended: bool
     ) -> Go | Wait | None:
         """Return what follows when another has a part of the way; None: ask again for a way round it."""
+        nearer = self._floor.up_to(go, part, self.trip, bodies)
+        if nearer is not None:
+            return nearer
         wait = self._floor.refused(go, holder, part, bodies, ended=ended)
         again = not (go.yields or self.trip.fixed or wait.in_line or self._avoid) and holder in bodies
         if again and now - self._looked >= DETOUR_S:
@@ -83,19 +86,26 @@ class Mover:
     def started(self, go: Go) -> None:
         """Note that it has a way reserved, and goes."""
         self.go, self.wait, self.stuck, self._leg, self.place = go, None, False, 0, go.place
-        if not go.yields:
+        if go.ends:
             self._since = None
 
     def stopped(self, at: Point) -> None:
         """Note that it was stopped on its way: it goes on from there."""
         if self.go is not None and not self.go.yields and not self.trip.fixed:
-            left = self.rest(at)[1:-1]
-            self.trip = replace(self.trip, points=(*left, self.trip.points[-1]))
+            left = self.rest(at)[1:]
+            # The end of a stretch is no point of the trip.
+            self.goes_on((*left[:-1], *self.go.wants) if self.go.wants else left)
         self.go = None
 
     def arrived(self) -> None:
-        """Note that it is at the end of its way."""
+        """Note that it is at the end of its way, or of a stretch."""
+        if self.go is not None and self.go.wants:
+            self.goes_on(self.go.wants)
         self.go = None
+
+    def goes_on(self, wants: tuple[Point, ...]) -> None:
+        """Note that it has the way behind it that comes before these points."""
+        self.trip = replace(self.trip, points=(*wants[:-1], self.trip.points[-1]))
 
     def rest(self, at: Point) -> tuple[Point, ...]:
         """Return what is left of its way."""
@@ -132,6 +142,7 @@ class Mover:
             state="moves" if go is not None else "waits" if wait is not None else "stands",
             place=go.place if go is not None else wait.place if wait is not None else "",
             way=way[:MOST_POINTS],
+            wants=go.wants[:MOST_POINTS] if go is not None else (),
             waits_for=wait.robot if wait is not None and go is None else "",
             why=wait.why if wait is not None and go is None else "",
             ticket=trip.ticket,
@@ -150,8 +161,17 @@ def _signature(trip: Trip, bodies: Mapping[str, Body], avoid: tuple[str, ...]) -
             each.stands,
             each.fresh,
             each.state.state if each.state is not None else "",
-            each.state.way if each.moved and each.state is not None else (),
-            (waiting.place, waiting.ticket, waiting.in_line, waiting.waits_for) if (waiting := each.waiting) else (),
+            (each.state.way, each.state.wants) if each.moved and each.state is not None else (),
+            (
+                waiting.place,
+                waiting.ticket,
+                waiting.in_line,
+                waiting.waits_for,
+                waiting.way,
+                waiting.waited_s >= PATIENCE_S,
+            )
+            if (waiting := each.waiting)
+            else (),
         )
         for each in bodies.values()
     ]

@@ -23,6 +23,8 @@ class FloorState(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The place that it goes to; empty: a coordinate."""
     way: Annotated[tuple[Point, ...], Meta(max_length=MOST_POINTS)] = ()
     """The way that it has reserved, or wants."""
+    wants: Annotated[tuple[Point, ...], Meta(max_length=MOST_POINTS)] = ()
+    """Where it goes on to from the end of the way, when that is one stretch only."""
     waits_for: str = ""
     """The robot that is in the way."""
     why: str = ""

@@ -221,6 +221,9 @@ class FloorSimulation:
         if self.mode == "reserved":
             self._stand(robot, mover)
         self._tell(robot)
+        if go.wants:
+            robot.ask_at = self.now + 2 * SEE_S  # it is seen there by then
+            return
         if go.yields:
             robot.waits_since = robot.waits_since or self.now
             robot.ask_at = self.now + ASK_S

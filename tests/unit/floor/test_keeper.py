@@ -232,3 +232,33 @@ async def test_what_is_not_reserved_is_sent_at_once(fleet: Fake, command: RobotC
     await drive(floor, fleet, command)
     assert fleet.sent == [command]
     assert fleet.told == []
+
+
+async def test_a_way_that_another_crosses_is_gone_in_stretches(floor: FloorKeeper, fleet: Fake) -> None:
+    """Each has an id of its own; the last one has the command's, and ends where the command does."""
+    crossing = ((15.0, -8.0, 0.0), (15.0, 8.0, 0.0))
+    fleet.put("b", 15.0, -8.0)
+    floor.bodies()
+    floor.sight.hear(FloorState(robot="b", state="moves", task="u", command="u/1", way=crossing), time.monotonic())
+    assert (await drive(floor, fleet, goto(20.0))).failure is None
+    ends = [each.args["waypoints"][-1]["x"] for each in fleet.sent]
+    assert fleet.sent[0].id == "t/s1/1~p1.1"
+    assert fleet.sent[-1].id == "t/s1/1"
+    assert [each.id for each in fleet.sent[1:-1]] == [f"t/s1/1~p1.{number}" for number in range(2, len(ends))]
+    assert ends == sorted(ends)
+    assert ends[-1] == 20.0
+    assert all(abs(end - 15.0) > 1.0 for end in ends)
+
+
+async def test_a_later_attempt_goes_on_from_the_end_of_a_stretch(floor: FloorKeeper, fleet: Fake) -> None:
+    """The gateway before has died meanwhile: points that the robot has passed are not gone to again."""
+    fleet.put("a", 5.0, 3.0)
+    floor.bodies()
+    await asyncio.sleep(0.1)
+    way = ((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (5.0, 3.0, 0.0))
+    state = FloorState(robot="a", state="moves", command="t/s1/1~p1.1", way=way, wants=((5.0, 8.0, 0.0),))
+    floor.sight.hear(state, time.monotonic())
+    args = {"waypoints": [{"x": 5.0, "y": 0.0}, {"x": 5.0, "y": 8.0}]}
+    await drive(floor, fleet, replace(goto(0.0, attempt=2), args=args))
+    assert [each.id for each in fleet.sent] == ["t/s1/1"]
+    assert fleet.sent[0].args["waypoints"] == [{"x": 5.0, "y": 8.0}]
