@@ -5,12 +5,12 @@
 # one of them that was late once would hide what all the others have shown. They (marked `fleet`) get a second run, which
 # is short and has the machine for itself; a test that fails in it as well fails the suite, and so does any other test
 # that failed. Properties are tried with the same examples in both runs, so that a counterexample that was found by chance
-# is not lost by chance. Tests outside tests/integration run in two processes, those in it one after another; of these the
-# slowest are listed.
+# is not lost by chance. Tests outside tests/integration run in two processes; those in it, which mostly wait, in three, each
+# a file at a time, but for those marked `alone`, which run after them one after another. Of these the slowest are listed.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
-marks=()
-[ "${1:-}" != -m ] || { marks=(-m "$2") && shift 2; }
+marks=
+[ "${1:-}" != -m ] || { marks=$2 && shift 2; }
 
 run() { "$here/as_user.sh" "$@"; }
 memory=$(run mktemp -d --tmpdir swiftbot-suite.XXXXXX) # of which tests failed
@@ -24,13 +24,17 @@ for path in "$@"; do
 done
 failed=0
 first() {
-    local status=0
-    suite ${marks[@]+"${marks[@]}"} "$@" || status=$?
+    local status=0 marked=$1
+    shift
+    suite -m "$marked" "$@" || status=$?
     # 1: tests failed; 5: none is marked so; anything else is a run that did not come to its end.
     case $status in 0 | 5) ;; 1) failed=1 ;; *) exit "$status" ;; esac
 }
-[ ${#together[@]} = 0 ] || first --numprocesses 2 --dist worksteal "${together[@]}"
-[ ${#apart[@]} = 0 ] || first --durations=40 "${apart[@]}"
+[ ${#together[@]} = 0 ] || first "$marks" --numprocesses 2 --dist worksteal "${together[@]}"
+[ ${#apart[@]} = 0 ] || {
+    first "${marks:+($marks) and }not alone" --numprocesses 3 --dist loadfile --durations=40 "${apart[@]}"
+    first "${marks:+($marks) and }alone" --durations=20 "${apart[@]}"
+}
 [ "$failed" = 1 ] || exit 0
 run test -e "$memory/v/cache/lastfailed" || {
     echo 'The run was ended by a test that stood still: the stacks above say where.' >&2

@@ -18,13 +18,17 @@ from appliance.pool.engine import remove_fleet, socket_path
 from appliance.skills.catalogue import Catalogue, load_catalogue
 
 HERE = Path(__file__).parent
+MEASURES = HERE / "bench"
+"""Tests whose figures would tell of what runs beside them."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what lies here as `fleet`: real processes, links and deadlines."""
+    """Mark what lies here as `fleet`: real processes, links and deadlines; and what measures or is long as `alone`."""
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.fleet)
+            if MEASURES in item.path.parents or item.get_closest_marker("long"):
+                item.add_marker(pytest.mark.alone)
 
 
 @pytest.fixture(scope="module")

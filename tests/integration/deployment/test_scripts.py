@@ -88,6 +88,23 @@ def test_well() -> None:
     pass
 """
 FAILS = "import pytest\n\n\n@pytest.mark.fleet\ndef test() -> None:\n    assert 0\n"
+SIDE_BY_SIDE = """
+import pathlib
+import pytest
+
+def note(word):
+    with pathlib.Path(__file__).with_name("ran").open("a") as ran:
+        ran.write(word + "\\n")
+
+@pytest.mark.alone
+def test_alone(worker_id):
+    assert worker_id == "master"
+    note("alone")
+
+def test_beside(worker_id):
+    assert worker_id.startswith("gw")
+    note("beside")
+"""
 
 
 def suite(project_root: Path, folder: Path, test: str) -> subprocess.CompletedProcess[str]:
@@ -119,6 +136,15 @@ def test_what_starts_no_fleet_has_no_second_run(project_root: Path, tmp_path: Pa
     assert done.returncode == 1, done.stdout + done.stderr
     assert "not run a second time" in done.stderr
     assert (tmp_path / "test_it.ran").exists()
+
+
+def test_what_is_marked_alone_runs_beside_nothing(project_root: Path, tmp_path: Path) -> None:
+    """Integration tests run in several processes, but for those marked `alone`, which run in one after all others."""
+    folder = tmp_path / "integration"
+    folder.mkdir()
+    done = suite(project_root, folder, SIDE_BY_SIDE)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (folder / "ran").read_text().split() == ["beside", "alone"]
 
 
 def test_an_unknown_argument_of_setup_is_refused(project_root: Path) -> None:
