@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
-from fleets import PLAIN, RULES
+from fleets import PLAIN, RULES, fleet_in
 from pymavlink import mavutil
 
 from appliance import config as configuration
@@ -390,9 +390,10 @@ async def test_the_command_line_tells_what_is_asked(fleet: FleetState) -> None:
         assert json.loads(shown.stdout)
 
 
-async def test_a_second_fleet_in_the_same_place_is_refused(fleet: FleetState) -> None:
+async def test_a_second_fleet_in_the_same_place_is_refused(tmp_path: Path) -> None:
     """`up` over a running fleet is an error that names the remedy; `down` without a fleet too."""
-    with pytest.raises(ConfigError, match="a fleet runs in"):
-        await local_fleet.up(Order(fleet=fleet.fleet, directory=Path(fleet.directory)), progress=print)
-    with pytest.raises(NotFoundError, match="no fleet runs"):
-        await local_fleet.down(Path(fleet.directory) / "elsewhere", progress=print)
+    async with fleet_in(tmp_path, gateways=1, zenoh=0, pool=PoolConfig(floor={})) as fleet:
+        with pytest.raises(ConfigError, match="a fleet runs in"):
+            await local_fleet.up(Order(fleet=fleet.fleet, directory=Path(fleet.directory)), progress=print)
+        with pytest.raises(NotFoundError, match="no fleet runs"):
+            await local_fleet.down(Path(fleet.directory) / "elsewhere", progress=print)

@@ -32,6 +32,7 @@ from appliance.model import (
     TaskState,
     keyspace,
 )
+from appliance.model.task_api import RunAsk
 from appliance.pool.settings import PoolConfig
 from workshop import local_fleet
 from workshop.local_fleet import Order
@@ -219,6 +220,9 @@ async def test_a_run_that_waits_goes_where_there_is_room_first_and_begins_once(u
         async with asyncio.timeout(30):
             while not client.plane.registry.gateways["gw-1"].searches.get("moved"):
                 await asyncio.sleep(0.1)
+        # A gateway that is told to stop lets its run come to its end.
+        ask = RunAsk(task="t-wait", subtask="long", attempt=1)
+        await client.plane.rpc.call("gw-1", keyspace.RUN_CANCEL, ask, timeout_s=20.0)
 
 
 async def test_a_task_stays_within_the_gateways_that_its_submitter_allows(up: Up) -> None:
