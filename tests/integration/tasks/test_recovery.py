@@ -323,12 +323,12 @@ async def test_whoever_watches_may_leave_and_the_task_goes_on(up: Up) -> None:
 
 @pytest.mark.long
 async def test_another_robot_takes_over_from_one_that_goes_offline(up: Up) -> None:
-    """The robot that films is killed: the other one goes to the place first, and films there."""
+    """The robot that films is killed: the other one goes to the place first, which has room for both, and films there."""
     state = await up(zenoh=2, sim_rate=4.0, pool=PoolConfig(floor={"base": 1, "vision": 1}))
     async with FleetClient(state.endpoint) as client:
         accepted = await client.submit(
             plan(
-                Subtask(id="s1", skill="goto", robot="any", params={"place": "dock 3"}),
+                Subtask(id="s1", skill="goto", robot="any", params={"place": "goal 1"}),
                 Subtask(
                     id="s2", skill="record_video", robot="any", params={"target": "aisle", "duration_s": 15.0},
                     after=("s1",),
@@ -344,7 +344,7 @@ async def test_another_robot_takes_over_from_one_that_goes_offline(up: Up) -> No
         (revision,) = record.revisions
         assert revision.kind is RevisionKind.ROBOT
         again = record.of(revision.added[0])
-        assert (again.subtask.skill, again.subtask.params) == ("goto", {"place": "dock 3"})
+        assert (again.subtask.skill, again.subtask.params) == ("goto", {"place": "goal 1"})
         film = record.of("s2")
         assert film.bound_robot == again.bound_robot != lost
         assert film.attempt >= 2

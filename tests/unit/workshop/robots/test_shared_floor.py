@@ -71,7 +71,8 @@ def test_no_two_too_near_on_any_site(site: Site, seed: int) -> None:
 
 
 @pytest.mark.long
-@settings(max_examples=60, deadline=None)
+@pytest.mark.timeout(900)
+@settings(max_examples=20, deadline=None)
 @given(sites(), st.integers(0, 1000))
 def test_no_two_of_six_too_near_on_any_site(site: Site, seed: int) -> None:
     """The same with more robots, for longer."""
