@@ -43,7 +43,7 @@ done
 
 PACKAGES=(podman runc crun uidmap slirp4netns fuse-overlayfs catatonit dbus-user-session mmdebstrap
   python3 python3-venv rsync ca-certificates)
-[ "$MODE" = dev ] && PACKAGES+=(systemd iproute2 tmux)  # iproute2: tests in network namespaces; tmux: the terminal UI in one
+[ "$MODE" = dev ] && PACKAGES+=(systemd iproute2 tmux groff-base)  # for tests: network namespaces, the UI in a terminal, manual pages
 # Gateways and recorders go by their clocks. What keeps them already is left alone, but for systemd-timesyncd, which chrony
 # replaces: it follows a clock that drifts, and tells how far off it is.
 keeps_time() { dpkg-query -W -f='${db:Status-Status}\n' chrony ntpsec ntp openntpd 2>/dev/null | grep -qx installed; }

@@ -29,7 +29,7 @@ def add_to(app: App) -> None:
             folder: Where they are written, such as /usr/local/share/man/man1; made where it is missing.
         """
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            durable.make_folder(folder, mode=0o755)
             for name, text in pages(app).items():
                 durable.write(folder / f"{name}.1", text.encode(), mode=0o644)
         except OSError as error:
@@ -145,5 +145,5 @@ def _text(text: str) -> str:
 
 
 def _line(text: str) -> str:
-    r"""Return a line of text; one that begins as a request does is told apart by `\&`."""
+    r"""Return a line of text; `\&` before one that begins as a request does."""
     return "\\&" * text.startswith((".", "'")) + _text(text)

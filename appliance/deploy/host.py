@@ -238,8 +238,10 @@ async def lay_out(bundle: Bundle, layout: Layout, *, say: Callable[[str], None])
             # Through its standard input: Podman's user cannot read this folder.
             await command("podman", "load", as_user=True, timeout_s=LOAD_S, data=image)
         shutil.rmtree(members)
-        with contextlib.suppress(SwiftbotError):  # a release of before has none
+        try:
             await command(str(staged / "venv/bin/swiftbot"), "manual", str(staged / "man"))
+        except SwiftbotError as error:
+            say(f"without manual pages: {error.message}")  # an older release cannot write them
         release = await asyncio.to_thread(layout.finish, staged, manifest.release, manifest.version)
     finally:
         if staged.exists():

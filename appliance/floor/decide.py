@@ -7,10 +7,10 @@ Rules, in the order in which they are looked at:
 2. A robot that stands keeps the ground under it, whether it has a task or not. Ways lead round it where there is room.
    One that moves without a reservation (by hand, by a pilot, unknown) has the ground that it can reach in `HAND_S` too.
 3. A way is reserved before its robot moves, and freed behind it (`geometry.cells`). Where others move or want to on it,
-   it is cut into stretches: each ends where the robot stands in nobody's way, about `STRETCH_M` further on or behind
+   it is cut into stretches: each ends where the robot blocks no other's way, about `STRETCH_M` further on or behind
    what it would block, and is reserved as a whole, so that a robot never stops in an aisle that another wants to pass.
    Who is refused goes up to the part that another has, or looks for a way round the one that has it, or waits. The way
-   of the one that has waited longest of all, for `PATIENCE_S` or more, is reserved by nobody else any more.
+   of the one that has waited longest of all, for `PATIENCE_S` or more, is reserved by no other any more.
 4. A robot that waits and stands in the way of another that waits for it gives way: it goes to the nearest spot that is
    in nobody's way. Where they wait for one another, in a ring of any length, only the one with the highest ticket does,
    of those that have such a spot.
@@ -45,7 +45,7 @@ APART_M = 0.1
 DETOUR, DETOUR_M = 1.6, 4.0
 """A way round a robot that moves is taken when it is at most so many times, and metres, longer."""
 STRETCH_M = 10.0
-"""So much of a way is reserved at a time, where a robot can stop so early in nobody's way."""
+"""So much of a way is reserved at a time, where a robot can stop so early without blocking another."""
 SHORTEST_M = 2.0
 """A robot does not set off for less, nor stop for less before the end."""
 YIELD_S = 2.0
@@ -217,7 +217,7 @@ class Floor:
         return _cut(go, spots[-1], me.size) if spots else None
 
     def _stretch(self, go: Go, trip: Trip, me: Body, others: Sequence[Body]) -> Go:
-        """Return what of a way is reserved at first: all of it where nobody else wants to pass."""
+        """Return what of a way is reserved at first: all of it where no other wants to pass."""
         if trip.flies or trip.fixed or geometry.length(go.way) <= STRETCH_M:
             return go
         near = [
@@ -232,15 +232,15 @@ class Floor:
         return _cut(go, early[-1] if early else spots[0], me.size)
 
     def _stops(self, go: Go, me: Body, others: Sequence[Body]) -> list[float]:
-        """Return how far along a way its robot can stop in nobody's way and at nobody's place, metres."""
+        """Return how far along a way its robot can stop off all places and without blocking another, metres."""
         last = geometry.length(go.way) - SHORTEST_M
         found: list[float] = []
         for end, _ in go.sweep:
-            if SHORTEST_M <= end <= last and self._in_nobodys_way(geometry.ahead(go.way, end)[-1][:2], me, others):
+            if SHORTEST_M <= end <= last and self._clear_of_others(geometry.ahead(go.way, end)[-1][:2], me, others):
                 found.append(end)
         return found
 
-    def _in_nobodys_way(self, spot: Flat, me: Body, others: Sequence[Body]) -> bool:
+    def _clear_of_others(self, spot: Flat, me: Body, others: Sequence[Body]) -> bool:
         kept = me.size.kept_m
         if any(math.dist(spot, self._centre(place)) < PLACE_M + 2 * kept for place in self.site.places):
             return False

@@ -1,7 +1,6 @@
 """Manual pages say what the help says, as man(7) wants it."""
 
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -46,7 +45,6 @@ def test_text_that_looks_like_a_request_is_text() -> None:
     assert "\n\\&'second\n" in text
 
 
-@pytest.mark.skipif(shutil.which("groff") is None, reason="groff is not installed: apt install groff")
 def test_groff_reads_them_without_a_warning(tmp_path: Path) -> None:
     """Each page that the command writes is well-formed."""
     assert app(["manual", str(tmp_path / "man1")], result_action="return_value") == Exit.DONE

@@ -220,7 +220,7 @@ async def test_a_run_that_waits_goes_where_there_is_room_first_and_begins_once(u
         async with asyncio.timeout(30):
             while not client.plane.registry.gateways["gw-1"].searches.get("moved"):
                 await asyncio.sleep(0.1)
-        # A gateway that is told to stop lets its run come to its end.
+        # A gateway that stops lets its run come to its end.
         ask = RunAsk(task="t-wait", subtask="long", attempt=1)
         await client.plane.rpc.call("gw-1", keyspace.RUN_CANCEL, ask, timeout_s=20.0)
 

@@ -54,7 +54,7 @@ def near(points: tuple[Point, ...], others: tuple[Point, ...]) -> bool:
 
 @settings(max_examples=150, deadline=None)
 @given(floors())
-def test_a_stretch_ends_in_nobodys_way(drawn: tuple[Floor, dict[str, Body], Trip]) -> None:
+def test_a_stretch_ends_where_it_blocks_no_other(drawn: tuple[Floor, dict[str, Body], Trip]) -> None:
     """Clear of all other robots, of the ways that they are on or want, and with the rest of the way behind it."""
     floor, seen, trip = drawn
     step = floor.decide(trip, seen)
