@@ -5,9 +5,9 @@
 # one of them that was late once would hide what all the others have shown. They (marked `fleet`) get a second run, which
 # is short and has the machine for itself; a test that fails in it as well fails the suite, and so does any other test
 # that failed. Properties are tried with the same examples in every run, so that what passed on one machine passes on the
-# next, and a counterexample comes again (`make check` and a bare pytest draw new ones; SWIFTBOT_SEED sets the seed, which
-# SWIFTBOT_SEED=$RANDOM makes a search). Tests outside tests/integration run in two processes; those in it, which mostly wait, in three, each
-# a file at a time, but for those marked `alone`, which run after them one after another. Of these the slowest are listed.
+# next, and a counterexample comes again; `make check` draws new ones, and so does SWIFTBOT_SEED=$RANDOM here.
+# Tests outside tests/integration run in two processes; those in it, which mostly wait, in three, each a file at a time,
+# but for those marked `alone`, which run after them one after another. Of these the slowest are listed.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 marks=
