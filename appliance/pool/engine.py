@@ -458,18 +458,6 @@ class PodmanEngine:
 
         return await self._ask("layers of images", work)
 
-    async def import_image(self, archive: Path, reference: str) -> str:
-        """Make an image of a root filesystem's tar archive and return its id."""
-
-        def work(client: Any) -> str:
-            with archive.open("rb") as body:
-                params = {"reference": reference}
-                response = client.api.post("/images/import", params=params, data=body, headers=_TAR, timeout=600)
-            response.raise_for_status()
-            return str(response.json()["Id"])
-
-        return await self._ask(f"import {reference}", work)
-
     async def export_image(self, image_id: str, take: Callable[[str, BinaryIO], None]) -> None:
         """Have Podman give an image; `take` gets each blob's SHA-256 and its bytes, uncompressed, on a thread."""
 

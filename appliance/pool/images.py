@@ -1,10 +1,10 @@
 """Builds and lists the images that skills run in.
 
 It exists because a gateway often has no image registry in reach: the root filesystem is made of the host's own
-Debian packages by `mmdebstrap` in a user namespace (no root needed) and imported through the Podman API. Where a
-base image is configured, the image's Containerfile is built on it instead. Python packages that its
-`requirements.txt` pins are laid over either from a folder of wheels (`wheels`). An image's tag is a hash of all that
-goes into it, so building again is a look at the list.
+Debian packages by `mmdebstrap` in a user namespace (no root needed) and loaded through the Podman API; the same
+packages make the same image on every machine (`oci`). Where a base image is configured, the image's Containerfile is
+built on it instead. Python packages that its `requirements.txt` pins are laid over either from a folder of wheels
+(`wheels`). An image's tag is a hash of its recipe, so building again is a look at the list.
 
 Which Debian packages the host trusts is read from its own apt sources (`host_sources`), cut down to the distribution's
 main suites: images are made of exactly what the machine itself would install, with the machine's mirrors and keys, and
@@ -15,19 +15,22 @@ import asyncio
 import hashlib
 import os
 import re
+import shlex
 import shutil
 import tempfile
 import time
 import tomllib
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import structlog
 from msgspec import Struct
 
 from appliance.errors import NotFoundError, PrerequisiteError
-from appliance.pool import wheels
+from appliance.model.transfer_api import ImageLayout
+from appliance.pool import oci, wheels
 from appliance.pool.engine import PodmanEngine
 from appliance.pool.settings import PoolConfig
 from appliance.pool.wheels import Python
@@ -280,13 +283,19 @@ def _needed(spec: ImageSpec, wheelhouses: Sequence[Path]) -> _Needed:
     return _Needed(file, requirements, folders)
 
 
-async def _run(what: str, command: Sequence[str], progress: Progress, *, remedy: str) -> None:
+async def _run(
+    what: str, command: Sequence[str], progress: Progress, *, remedy: str, variables: Mapping[str, str] | None = None
+) -> None:
     """Run a build step; PrerequisiteError with the log's tail when it fails."""
     if shutil.which(command[0]) is None:
         raise PrerequisiteError(f"{what}: {command[0]} is not installed", remedy=f"apt-get install {command[0]}")
     tail: deque[str] = deque(maxlen=15)
     process = await asyncio.create_subprocess_exec(
-        *command, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+        *command,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        env=os.environ | (variables or {}),
     )
 
     async def follow() -> int:
@@ -367,7 +376,8 @@ async def _from_packages(spec: ImageSpec, full: str, engine: PodmanEngine, neede
     with tempfile.TemporaryDirectory(prefix="swiftbot-image-") as folder:
         list_file = Path(folder) / "sources.list"
         list_file.write_text("\n".join(sources) + "\n", encoding="utf-8")
-        archive = Path(folder) / "root.tar"
+        archive, lists = Path(folder) / "root.tar", Path(folder) / "lists"
+        lists.mkdir()
         command = [
             "mmdebstrap",
             "--mode=unshare",
@@ -375,6 +385,7 @@ async def _from_packages(spec: ImageSpec, full: str, engine: PodmanEngine, neede
             f"--variant={recipe['variant']}",
             f"--include={','.join(spec.packages)}",
             *(f"--dpkgopt=path-exclude={pattern}" for pattern in recipe["exclude"]),
+            f"--customize-hook=copy-out /var/lib/apt/lists {shlex.quote(str(lists))}",
             *await _proxies(),
             release,
             str(archive),
@@ -384,15 +395,34 @@ async def _from_packages(spec: ImageSpec, full: str, engine: PodmanEngine, neede
             f"check that each of {', '.join(spec.packages)} is a package of {release}, that the machine's apt sources"
             " answer, and that the user has a range in /etc/subuid and /etc/subgid"
         )
-        await _run(f"building {spec.name} from Debian packages", command, progress, remedy=remedy)
+        # Maintainer scripts go by both: days in /etc/shadow, hashes in place of times in bytecode, the order of sets.
+        variables = {"SOURCE_DATE_EPOCH": str(recipe["made"]), "PYTHONHASHSEED": "0"}
+        what = f"building {spec.name} from Debian packages"
+        await _run(what, command, progress, remedy=remedy, variables=variables)
         if needed.requirements:
             root = Path(folder) / "root"
             root.mkdir()
             python = await asyncio.to_thread(wheels.python_of, archive)
             await asyncio.to_thread(needed.unpack, root, python, progress)
             await asyncio.to_thread(wheels.append, archive, root)
-        progress(f"importing {archive.stat().st_size / 2**20:.0f} MB")
-        await engine.import_image(archive, full)
+        await _load(full, engine, archive, lists, made=recipe["made"], progress=progress)
+
+
+async def _load(full: str, engine: PodmanEngine, archive: Path, lists: Path, *, made: int, progress: Progress) -> None:
+    """Make an image of a root filesystem's archive: the same one wherever its content is the same."""
+    packages = await asyncio.to_thread(oci.packages, archive, lists)
+    layer = archive.with_name("layer.tar")
+    extra = {oci.PACKAGES: oci.listing(packages)}
+    digest, size = await asyncio.to_thread(oci.write_layer, archive, layer, made=made, extra=extra)
+    config = oci.configuration(digest, made=made)
+    image_id = hashlib.sha256(config).hexdigest()
+    progress(f"loading {size / 2**20:.0f} MiB of {len(packages)} packages as {image_id[:12]}")
+    layout = ImageLayout(reference=full, image_id=image_id, layers=(digest,))
+    await engine.load_image(partial(oci.oci_archive, layout, config, {digest: layer}, {digest: size}))
+    if (found := (await engine.image(full)).id) != image_id:
+        raise PrerequisiteError(
+            f"Podman loaded {full} as {found[:12]}, not as {image_id[:12]}", remedy="take Podman 4.3 or newer"
+        )
 
 
 async def _proxies() -> list[str]:

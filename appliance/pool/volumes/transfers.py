@@ -13,12 +13,10 @@ so a layer is the same thing on every gateway, and one that is here is never ask
 import asyncio
 import contextlib
 import hashlib
-import io
 import secrets
-import tarfile
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator, Mapping
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,6 +47,7 @@ from appliance.model.transfer_api import (
 )
 from appliance.plane.node import Plane
 from appliance.pool.engine import PodmanEngine
+from appliance.pool.oci import oci_archive
 from appliance.pool.selection import UNMEASURED, Link
 from appliance.pool.settings import TransferConfig
 from appliance.pool.volumes.lineage import Relation, VolumeRecord, relation
@@ -61,8 +60,6 @@ MOST_LAYERS = 128
 MOST_CONFIG = 4 * 2**20
 MOST_LAYOUT = 64 * 2**10
 """Several times what `MOST_LAYERS` digests take."""
-_COPY = 2**20
-_OCI = "application/vnd.oci.image"
 
 
 def read_layout(data: bytes, reference: str) -> ImageLayout:
@@ -96,63 +93,6 @@ def check_config(layout: ImageLayout, config: Path) -> bytes:
     if found != [f"sha256:{each}" for each in layout.layers]:
         raise PayloadError(f"image {layout.reference} is not made of what was announced")
     return data
-
-
-def oci_archive(
-    layout: ImageLayout, config: bytes, blobs: Mapping[str, Path], sizes: Mapping[str, int]
-) -> Iterator[bytes]:
-    """An OCI archive, piece by piece, with those layers that are in `blobs`. Blocks while it reads them.
-
-    Args:
-        layout: what the image is made of.
-        config: its configuration.
-        blobs: the layers that are not in Podman's storage yet.
-        sizes: of all layers that are known; of one that is in the storage it does not matter.
-    """
-    manifest = msgspec.json.encode(
-        {
-            "schemaVersion": 2,
-            "mediaType": f"{_OCI}.manifest.v1+json",
-            "config": _descriptor(f"{_OCI}.config.v1+json", layout.image_id, len(config)),
-            "layers": [_descriptor(f"{_OCI}.layer.v1.tar", each, sizes.get(each, 0)) for each in layout.layers],
-        }
-    )
-    digest = hashlib.sha256(manifest).hexdigest()
-    named = _descriptor(f"{_OCI}.manifest.v1+json", digest, len(manifest))
-    index = {
-        "schemaVersion": 2,
-        "manifests": [named | {"annotations": {"org.opencontainers.image.ref.name": layout.reference}}],
-    }
-    yield from _member("oci-layout", b'{"imageLayoutVersion":"1.0.0"}')
-    yield from _member("index.json", msgspec.json.encode(index))
-    yield from _member(f"blobs/sha256/{digest}", manifest)
-    yield from _member(f"blobs/sha256/{layout.image_id}", config)
-    for each, path in blobs.items():
-        size = path.stat().st_size
-        yield _header(f"blobs/sha256/{each}", size)
-        with path.open("rb") as file:
-            while data := file.read(_COPY):
-                yield data
-        yield bytes(-size % tarfile.BLOCKSIZE)
-    yield bytes(2 * tarfile.BLOCKSIZE)
-
-
-def _descriptor(media_type: str, digest: str, size: int) -> dict[str, Any]:
-    return {"mediaType": media_type, "digest": f"sha256:{digest}", "size": size}
-
-
-def _header(name: str, size: int) -> bytes:
-    info = tarfile.TarInfo(name)
-    info.size, info.mode = size, 0o644
-    return info.tobuf(tarfile.GNU_FORMAT)
-
-
-def _member(name: str, data: bytes) -> Iterator[bytes]:
-    out = io.BytesIO()
-    out.write(_header(name, len(data)))
-    out.write(data)
-    out.write(bytes(-len(data) % tarfile.BLOCKSIZE))
-    yield out.getvalue()
 
 
 log = structlog.get_logger(__name__)
