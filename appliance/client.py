@@ -67,7 +67,7 @@ from appliance.model.learn_api import (
     Steering,
 )
 from appliance.model.learning import Recipe, Reference, RunRecord
-from appliance.model.plane_api import RosterAsk, RosterTold
+from appliance.model.plane_api import SealedAsk, SealedTold
 from appliance.model.planner_api import SwapAsk, Swapped
 from appliance.model.pool_api import (
     DecisionList,
@@ -453,9 +453,13 @@ class SteeringCalls(FleetConnection):
         ask = ResumeRobotsAsk(robots=tuple(robots), stops=seen, **self._sign(why))
         return await self._ask(keyspace.SOFT_RESUME, ask)
 
-    async def hand_roster(self, number: int, sealed: bytes) -> RosterTold:
+    async def hand_roster(self, number: int, sealed: bytes) -> SealedTold:
         """Give a gateway the authority's roster, as its file has it; all others have it within seconds."""
-        return await self._ask(keyspace.ROSTER, RosterAsk(number=number, sealed=sealed))
+        return await self._ask(keyspace.ROSTER, SealedAsk(number=number, sealed=sealed))
+
+    async def hand_parts(self, number: int, sealed: bytes) -> SealedTold:
+        """Give a gateway a signed list of parts, as its file has it; all others have it within seconds."""
+        return await self._ask(keyspace.PARTS, SealedAsk(number=number, sealed=sealed))
 
     async def standing(self) -> Standing:
         """The soft stops and leases in force, as any one gateway knows them."""

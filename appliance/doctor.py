@@ -31,7 +31,7 @@ from msgspec import Struct
 
 from appliance.config import GatewayConfig
 from appliance.errors import SwiftbotError
-from appliance.identity.parts import DEVELOPMENT, InForce, Kind
+from appliance.identity.parts import DEVELOPMENT, FILE, InForce, Kind
 from appliance.llm.settings import folder_of
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
@@ -586,7 +586,11 @@ def check_parts(config: GatewayConfig) -> Check:
     from appliance.identity.bundle import Bundle  # noqa: PLC0415 - as in check_keys
 
     try:
-        in_force = InForce.beside(Bundle.load(Path(config.plane.keys).expanduser()), config.plane.parts_file)
+        in_force = InForce.beside(
+            Bundle.load(Path(config.plane.keys).expanduser()),
+            config.plane.parts_file,
+            Path(config.data_dir).expanduser() / FILE,
+        )
         without_unsigned(_catalogue(config), in_force)
         if (model := Path(folder_of(config.llm.local_model))).is_dir() and config.llm.local_model:
             in_force.check_folder(Kind.MODEL, model)

@@ -603,8 +603,10 @@ class Gateway:
         credentials = self.plane.session.credentials
         if credentials is None:
             log.warning(DEVELOPMENT)
+            await self.plane.hand_on(None, keyspace.PARTS)
             return catalogue
-        self._parts = InForce.beside(credentials.bundle, self.config.plane.parts_file, kept=self._data / PARTS_FILE)
+        self._parts = InForce.beside(credentials.bundle, self.config.plane.parts_file, self._data / PARTS_FILE)
+        await self.plane.hand_on(self._parts, keyspace.PARTS)
         return await asyncio.to_thread(without_unsigned, catalogue, self._parts)
 
     def _check_model(self, folder: Path) -> None:

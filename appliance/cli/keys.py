@@ -85,9 +85,7 @@ class Reach:
 
     connect: Annotated[
         tuple[str, ...],
-        Parameter(
-            env_var="SWIFTBOT_CONNECT", help="Endpoint of a gateway that gets the roster, such as tls/10.0.0.1:7447."
-        ),
+        Parameter(env_var="SWIFTBOT_CONNECT", help="Endpoint of a gateway that gets it, such as tls/10.0.0.1:7447."),
     ] = ()
     keys: Annotated[
         Path | None,
@@ -344,7 +342,7 @@ def _show_issued(bundle: "Bundle", *, as_json: bool) -> None:
     if identity.role is Role.GATEWAY and not hosts:
         lines.append("It is dialled on the loopback only; for other machines give --host.")
     if identity.role is Role.GATEWAY:
-        lines.append("It runs only skills, images and models that are signed: swiftbot parts list, sign, install.")
+        lines.append("It runs only skills, images and models that are signed: swiftbot parts list, sign, publish.")
     if identity.role in (Role.GATEWAY, Role.ROBOT):
         lines.append(
             "next: copy it to its machine, and give the fleet the roster: swiftbot keys publish --connect ENDPOINT"

@@ -10,8 +10,8 @@ from rich.text import Text
 
 from appliance import console
 from appliance.cli.common import TOOLS, Json, complete, show
-from appliance.cli.keys import KEPT, Kept
-from appliance.errors import ConfigError, Exit, IdentityError
+from appliance.cli.keys import KEPT, REACH, Kept, Reach
+from appliance.errors import ConfigError, ConflictError, Exit, IdentityError
 
 if TYPE_CHECKING:
     from appliance.config import GatewayConfig
@@ -82,7 +82,8 @@ async def sign(
     signed = sign_parts(authority, [_unsigned(file) for file in lists], out)
     text = Text(
         f"signed {_counts(signed)} as number {signed.number} of fleet {signed.fleet}\n"
-        f"next: copy {out or authority.folder / FILE} to each gateway, and there: swiftbot parts install FILE"
+        "next: swiftbot parts publish --connect ENDPOINT; without a link, copy "
+        f"{out or authority.folder / FILE} to a gateway, and there: swiftbot parts install FILE"
     )
     show(signed, as_json=as_json, table=text)
     return Exit.DONE
@@ -105,6 +106,25 @@ def _unsigned(file: Path) -> "Parts":
     if not (found.image or found.skill or found.model):
         raise ConfigError(f"{file} names no part", remedy=remedy)
     return found
+
+
+@parts_app.command
+async def publish(*, as_json: Json = False, kept: Kept = KEPT, reach: Reach = REACH) -> int:
+    """Give a running fleet the authority's signed list: every gateway has it within seconds, and checks it itself."""
+    from appliance.identity import certificates, parts
+
+    authority = kept.load()
+    sealed = parts.read(authority.folder / parts.FILE)
+    number = parts.unseal(sealed, certificates.ed25519_of(authority.certificate), authority.fleet).number
+    async with reach.client(authority.fleet) as client:
+        told = await client.hand_parts(number, sealed)
+    if told.number > number:
+        raise ConflictError(
+            f"the fleet has list {told.number}, and this authority is at {number}",
+            remedy="this folder is an old copy: use the newest one",
+        )
+    show({"parts": told.number}, as_json=as_json, table=Text(f"the fleet has list of parts {told.number}"))
+    return Exit.DONE
 
 
 @parts_app.command(name="show")
@@ -177,10 +197,9 @@ async def install(
     config: Annotated[Path, Parameter(name="--config", help="The gateway's TOML file.")] = Path(
         "/etc/swiftbot/gateway.toml"
     ),
-    older: Annotated[bool, Parameter(help="Go back to a list that is older than the one that counts.")] = False,
     as_json: Json = False,
 ) -> int:
-    """Put a signed list in place on this gateway, checked: images and models go by it at once, skills after a restart.
+    """Put a signed list in place on this gateway, checked; others get it from it. Skills go by it after a restart.
 
     Args:
         file: The list, as `swiftbot parts sign` has written it.
@@ -188,7 +207,7 @@ async def install(
     from appliance.deploy.parts import install as install_parts
 
     read = _config(config)
-    found = install_parts(read, file, older=older)
+    found = install_parts(read, file)
     text = Text(
         f"{read.plane.parts_file} is number {found.number}: {_counts(found)}\n"
         "next: restart the gateway if skills changed"

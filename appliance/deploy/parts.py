@@ -68,20 +68,23 @@ def in_force(config: GatewayConfig) -> InForce:
     """Return what counts on this machine by a gateway's configuration; nothing is written."""
     if not config.plane.keys:
         return parts.ALL
-    return InForce.beside(Bundle.load(Path(config.plane.keys).expanduser()), config.plane.parts_file)
+    return InForce.beside(Bundle.load(Path(config.plane.keys).expanduser()), config.plane.parts_file, _kept(config))
 
 
-def install(config: GatewayConfig, file: Path, *, older: bool) -> Parts:
-    """Put a signed list where a gateway looks for it, checked; it counts at the next look.
+def _kept(config: GatewayConfig) -> Path:
+    return Path(config.data_dir).expanduser() / parts.FILE
+
+
+def install(config: GatewayConfig, file: Path) -> Parts:
+    """Put a signed list where a gateway looks for it, checked; it counts at the next look, and other gateways get it.
 
     Args:
         config: the gateway's.
         file: the list.
-        older: whether it may be older than the one that counts.
 
     Raises:
         IdentityError: the gateway has no keys; the list is damaged, of another fleet or authority.
-        ConflictError: it is older.
+        ConflictError: it is older than the one that counts.
     """
     if not config.plane.keys:
         raise IdentityError(parts.DEVELOPMENT, remedy="set plane.keys: docs/security.md")
@@ -89,17 +92,12 @@ def install(config: GatewayConfig, file: Path, *, older: bool) -> Parts:
     authority, fleet = certificates.ed25519_of(bundle.authority), bundle.identity.fleet
     data = parts.read(file)
     found = parts.unseal(data, authority, fleet)
-    kept, target = Path(config.data_dir).expanduser() / parts.FILE, config.plane.parts_file
-    for path in (kept, target):
+    for path in (_kept(config), config.plane.parts_file):
         with contextlib.suppress(IdentityError):  # absent or damaged: this one is better
             before = parts.unseal(parts.read(path), authority, fleet)
-            if found.number < before.number and not older:
+            if found.number < before.number:
                 raise ConflictError(
-                    f"{file} is number {found.number}, and {before.number} counts here",
-                    remedy="copy the newest; --older goes back to this one",
+                    f"{file} is number {found.number}, and {before.number} counts here", remedy=parts.SIGN_AGAIN
                 )
-    if older:
-        # The kept one first: what is older than that does not count.
-        files.write(kept, data, mode=files.PUBLIC)
-    files.write(target, data, mode=files.PUBLIC)
+    files.write(config.plane.parts_file, data, mode=files.PUBLIC)
     return found

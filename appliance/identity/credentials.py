@@ -122,7 +122,8 @@ class Credentials:
         if kept is not None and kept.exists():
             try:
                 found._read(kept)
-                found._kept_number = found.roster.number
+                number = found.roster.number
+                found._kept_number = number
             except IdentityError as error:
                 # The one of the keys' folder counts then.
                 log.warning("the roster is not taken", file=str(kept), reason=str(error))
@@ -289,6 +290,11 @@ class Credentials:
 
     def _read(self, path: Path) -> None:
         self.take(files.read(path, private=False, absent="copy it from the authority", most=roster.MOST_BYTES))
+
+    @property
+    def number(self) -> int:
+        """Of the roster that counts."""
+        return self.roster.number
 
     def take(self, sealed: bytes) -> None:
         """Go by a roster, as its file has it.

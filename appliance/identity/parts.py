@@ -1,7 +1,8 @@
 """The signed list of parts: which images, skills and models the gateways of a fleet may fetch, load and run.
 
 The authority signs it, as it signs the roster, and each version has a higher number than the last. A gateway with keys
-goes by the file beside them (`parts.json`) and refuses what is not named there; without that file it runs nothing.
+goes by the newest of the file beside them (`parts.json`), of what other gateways hand on (`plane.handing`) and of what
+counted before, which is kept with its data; it refuses what is not named there, and runs nothing without a list.
 A gateway without keys is in development mode: nothing is checked, and its status says so.
 
 A part is named with a digest of its content: of an image its id (the SHA-256 of its configuration, which names its
@@ -40,7 +41,8 @@ LEFT_OUT = frozenset({"__pycache__", ".git", ".hg", ".svn"})
 _MOST_REFUSED = 32
 _NAME = "list of parts"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_SIGN = "`swiftbot parts list`, `swiftbot parts sign` at the authority, `swiftbot parts install` here"
+_SIGN = "`swiftbot parts list`, then `swiftbot parts sign` and `publish` at the authority"
+SIGN_AGAIN = "to go back sign the older one again, as the next: `swiftbot parts show OLD --json`, `swiftbot parts sign`"
 
 Digests = dict[str, tuple[str, ...]]
 
@@ -138,7 +140,7 @@ class InForce:
         file: the signed list; None: development mode, in which everything is allowed.
         authority: whose signature counts.
         fleet: whose list counts.
-        kept: where the list is kept that was taken last: an older one is refused, also after a restart.
+        kept: where the list is kept that counted last: an older one is refused, also after a restart.
     """
 
     def __init__(
@@ -151,6 +153,9 @@ class InForce:
     ) -> None:
         self._file, self._authority, self._fleet, self._kept = file, authority, fleet, kept
         self._parts = Parts()
+        self._sealed = b""
+        self._kept_number = -1
+        """Of the list in `kept`; -1: that has not been read."""
         self._stamp: tuple[int, int, int] | None = None
         self._why = "" if file is None else f"{file} has not been read"
         self._refused: dict[tuple[Kind, str], str] = {}
@@ -174,6 +179,17 @@ class InForce:
         """The list that counts; an empty one where none does."""
         self._look()
         return self._parts
+
+    @property
+    def number(self) -> int:
+        """Of the list that counts; 0: none does."""
+        return self.parts.number
+
+    @property
+    def sealed(self) -> bytes:
+        """The list that counts, as its file has it."""
+        self._look()
+        return self._sealed
 
     @property
     def problem(self) -> str:
@@ -225,11 +241,38 @@ class InForce:
         if self.checked:
             self.check(kind, folder.name, folder_digest(folder))
 
+    def take(self, sealed: bytes, /) -> None:
+        """Go by a list that another gateway or an engineer hands on.
+
+        Raises:
+            IdentityError: it is damaged, of another fleet, another authority signed it, or it is older.
+        """
+        assert self._authority is not None  # noqa: S101 - who has no keys is handed nothing
+        self._look()
+        found = unseal(sealed, self._authority, self._fleet)
+        with self._looking:
+            self._check_new(found)
+            self._count(found, sealed)
+
+    def keep(self) -> None:
+        """Have the list that counts on the disk, where it is to be kept; blocks."""
+        self._look()
+        with self._looking:
+            if self._kept is None or self._parts.number <= max(self._kept_number, 0):
+                return
+            try:
+                files.write(self._kept, self._sealed, mode=files.PUBLIC)
+                self._kept_number = self._parts.number
+            except IdentityError as error:
+                log.warning("the list of parts cannot be kept", file=str(self._kept), reason=error.message)
+
     def _look(self) -> None:
-        """Take up another list, where the file has one."""
+        """Take up a newer list, where the file has one."""
         if self._file is None or self._authority is None:
             return
         with self._looking:
+            if self._kept_number < 0:
+                self._kept_number = self._take_kept(self._authority)
             try:
                 about = self._file.stat()
                 stamp = about.st_ino, about.st_mtime_ns, about.st_size
@@ -238,39 +281,52 @@ class InForce:
             except OSError:
                 stamp = None
             try:
-                found = self._taken(read(self._file))
+                data = read(self._file)
+                found = unseal(data, self._authority, self._fleet)
+                if older := found.number < self._parts.number:
+                    log.info("a newer list of parts counts", number=self._parts.number, file=str(self._file))
+                else:
+                    self._check_new(found)
             except IdentityError as error:
-                if (why := f"{self._file}: {error.message}") != self._why:
+                # Where others handed it on, there need be none beside the keys.
+                why = "" if stamp is None and self._parts.number else f"{self._file}: {error.message}"
+                if why and why != self._why:
                     log.warning("the list of parts is not taken", file=str(self._file), reason=error.message)
                 self._why, self._stamp = why, stamp
                 return
-            self._parts, self._stamp, self._why = found, stamp, ""
-            self._refused.clear()
-            log.info("the list of parts counts", number=found.number)
+            self._stamp, self._why = stamp, ""
+            if not older:
+                self._count(found, data)
 
-    def _taken(self, data: bytes) -> Parts:
-        """Return the list of a file, and keep it; IdentityError where it is not good, or older than the one kept."""
-        assert self._authority is not None  # noqa: S101 - the caller has looked
-        found = unseal(data, self._authority, self._fleet)
-        before = max(self._parts.number, self._kept_number())
-        # Asked for: `install --older` has put the older one in the kept one's place first.
-        if found.number < before and found.number != self._kept_number():
+    def _check_new(self, found: Parts) -> None:
+        """Raise IdentityError where a list is older than the one that counts, or another of the same number."""
+        number = self._parts.number
+        if found.number < number or (found.number == number and found != self._parts):
+            another = "another of its number" if found.number == number else str(number)
             raise IdentityError(
-                f"it is number {found.number}, and {before} has counted here already",
-                remedy="copy the newest; `swiftbot parts install FILE --older` goes back",
+                f"the {_NAME} is number {found.number}, and {another} counts here already", remedy=SIGN_AGAIN
             )
-        if self._kept is not None and found.number != self._kept_number():
-            files.write(self._kept, data, mode=files.PUBLIC)
-        return found
 
-    def _kept_number(self) -> int:
-        if self._kept is None or self._authority is None or not self._kept.exists():
+    def _count(self, found: Parts, sealed: bytes) -> None:
+        """Go by a list; the lock is held."""
+        if found.number == self._parts.number:
+            return
+        self._parts, self._sealed = found, sealed
+        self._refused.clear()
+        log.info("the list of parts counts", number=found.number)
+
+    def _take_kept(self, authority: "Ed25519PublicKey") -> int:
+        """Go by the list that counted before; returns its number, 0 where there is none."""
+        if self._kept is None or not self._kept.exists():
             return 0
         try:
-            return unseal(read(self._kept), self._authority, self._fleet).number
+            data = read(self._kept)
+            found = unseal(data, authority, self._fleet)
         except IdentityError as error:
             log.warning("the list of parts that was kept is not good", file=str(self._kept), reason=error.message)
             return 0
+        self._count(found, data)
+        return found.number
 
 
 ALL = InForce()

@@ -626,11 +626,20 @@ MEMBER = Verb(
 )
 ROSTER = Verb(
     "roster",
-    plane_api.RosterAsk,
-    plane_api.RosterTold,
+    plane_api.SealedAsk,
+    plane_api.SealedTold,
     "compare rosters; the newer one counts, if the authority has signed it",
     exchange=False,
     asks=STEERING,
+    signed=True,
+)
+PARTS = Verb(
+    "parts",
+    plane_api.SealedAsk,
+    plane_api.SealedTold,
+    "compare lists of parts; the newer one counts, if the authority has signed it",
+    exchange=False,
+    asks=ENGINEERS,
     signed=True,
 )
 REOPENING = Verb(

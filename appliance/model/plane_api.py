@@ -264,16 +264,16 @@ class Member(Struct, frozen=True):
     """The challenge, signed as a request for this verb (`identity.signing`): it is the gateway of that id."""
 
 
-class RosterAsk(Struct, frozen=True):
-    """`roster`: which roster have you? With `sealed`: take this one, unless you have a newer."""
+class SealedAsk(Struct, frozen=True):
+    """`roster`, `parts`: which one have you? With `sealed`: take this one, unless you have a newer."""
 
     number: int
-    """Of the roster of the one that asks."""
+    """Of the one that the asking member has."""
     sealed: bytes = b""
-    """The roster's file, which the authority has signed."""
+    """The file, which the authority has signed."""
 
 
-class RosterTold(Struct, frozen=True):
+class SealedTold(Struct, frozen=True):
     """The answer: what counts there now."""
 
     number: int

@@ -23,12 +23,13 @@ from msgspec.structs import replace
 
 from appliance.errors import ConfigError, DeadlineError, IdentityError, SwiftbotError, UnreachableError
 from appliance.model import keyspace
-from appliance.model.keys import Keys, check_name
-from appliance.model.plane_api import Member, MemberAsk
+from appliance.model.keys import Keys, Verb, check_name
+from appliance.model.plane_api import Member, MemberAsk, SealedAsk, SealedTold
 from appliance.model.roles import Role
 from appliance.plane.anti_entropy import Reconciler
 from appliance.plane.dht import Browsing, Dht
 from appliance.plane.events import FleetEvent, FleetEvents, RingChanged, Stage
+from appliance.plane.handing import Handing, Held
 from appliance.plane.leases import Leases
 from appliance.plane.link import dialled
 from appliance.plane.membership import Membership, Outlived, StallDetector, displaced
@@ -37,7 +38,6 @@ from appliance.plane.records import Resolver, by_bytes
 from appliance.plane.registry import Registry
 from appliance.plane.reopening import Reopener
 from appliance.plane.ring import Ring
-from appliance.plane.rosters import Rosters
 from appliance.plane.rpc import Rpc
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
@@ -133,13 +133,16 @@ class Plane:
         )
         self.rpc.register(keyspace.MEMBER, self._on_member)
         self._roster_news = asyncio.Event()
-        self._rosters = Rosters(
+        self._rosters = Handing(
             session.credentials,
+            keyspace.ROSTER,
             gateway=gateway,
             rpc=self.rpc,
             members=self.members,
             on_taken=self._roster_news.set,
         )
+        self._handed: list[Handing] = []
+        """What else of the authority is handed on."""
         self.on_revoked: Callable[[frozenset[str]], Awaitable[None]] | None = None
         """Called with the robots whose certificates a new roster has revoked, before their links are closed."""
         self._reopener = Reopener(session, gateway=gateway, rpc=self.rpc, members=self.members, events=self.events)
@@ -291,13 +294,25 @@ class Plane:
                     await self._membership.prove_again()
                     # Last: where one of these steps breaks, all are done again.
                     number = found
-                await self._rosters.spread()
+                for each in (self._rosters, *self._handed):
+                    await each.spread()
                 if credentials.stale:
                     await self._reopener.reopen("other keys, or other robots")
             except Exception:
                 if self.session.gone:
                     raise
                 log.exception("looking at the roster broke; it goes on")
+
+    async def hand_on(self, held: Held | None, verb: Verb[SealedAsk, SealedTold]) -> None:
+        """Hand another signed file on from now on, and see first whether a member has a newer one.
+
+        Args:
+            held: the file; None without keys: the verb is answered, and refused.
+            verb: by which gateways compare.
+        """
+        handing = Handing(held, verb, gateway=self.gateway, rpc=self.rpc, members=self.members)
+        await handing.spread()
+        self._handed.append(handing)
 
     async def until_gone(self) -> None:
         """Wait until the session was closed to be reopened and could not be; raises why. Without keys it returns."""

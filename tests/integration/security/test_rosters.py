@@ -15,7 +15,7 @@ from appliance.errors import IdentityError
 from appliance.identity.authority import Authority as Issuer
 from appliance.model import RobotCommand, RobotInfo, RobotReply, encode, keyspace
 from appliance.model.keys import Keys
-from appliance.model.plane_api import RosterAsk
+from appliance.model.plane_api import SealedAsk
 from appliance.model.robot_api import StopAsk
 from appliance.model.roles import Role
 from appliance.plane.client import PlaneClient
@@ -73,11 +73,11 @@ async def test_an_older_roster_brings_nothing_back(fleet: Secured) -> None:
     newest = fleet.authority.roster.number
     await until(lambda: number_at(fleet, "g1") == newest)
     await until((fleet.folder / "data-g1" / ROSTER_FILE).exists)
-    ask = RosterAsk(number=newest - 1, sealed=old)
+    ask = SealedAsk(number=newest - 1, sealed=old)
     told = await fleet.planes["g0"].rpc.call("g1", keyspace.ROSTER, ask)
     assert told.number == newest
     with pytest.raises(IdentityError, match="counts already"):
-        await fleet.planes["g0"].rpc.call("g1", keyspace.ROSTER, RosterAsk(number=newest + 1, sealed=old))
+        await fleet.planes["g0"].rpc.call("g1", keyspace.ROSTER, SealedAsk(number=newest + 1, sealed=old))
     await apart(fleet)
     assert number_at(fleet, "g1") == newest
 
@@ -91,7 +91,7 @@ async def test_only_the_authority_makes_rosters(fleet: Secured, tmp_path: Path) 
         before = number_at(fleet, "g0")
         if bad:
             with pytest.raises(IdentityError):
-                await client.rpc.call("g0", keyspace.ROSTER, RosterAsk(number=10**6, sealed=bad))
+                await client.rpc.call("g0", keyspace.ROSTER, SealedAsk(number=10**6, sealed=bad))
         assert number_at(fleet, "g0") == before
     await client.close()
 
@@ -103,10 +103,10 @@ async def test_an_operator_gives_the_fleet_the_roster_and_a_viewer_may_not(fleet
     sealed, number = fleet.authority.roster_file.read_bytes(), fleet.authority.roster.number
     viewer = await PlaneClient.open(fleet.client(Role.VIEWER), fleet=FLEET)
     with pytest.raises(IdentityError, match="may not ask roster"):
-        await viewer.rpc.call("g0", keyspace.ROSTER, RosterAsk(number=number, sealed=sealed))
+        await viewer.rpc.call("g0", keyspace.ROSTER, SealedAsk(number=number, sealed=sealed))
     await viewer.close()
     client = await PlaneClient.open(fleet.client(Role.OPERATOR), fleet=FLEET)
-    told = await client.rpc.call("g0", keyspace.ROSTER, RosterAsk(number=number, sealed=sealed))
+    told = await client.rpc.call("g0", keyspace.ROSTER, SealedAsk(number=number, sealed=sealed))
     assert told.number == number
     await client.close()
 

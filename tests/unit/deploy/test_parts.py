@@ -98,8 +98,8 @@ def test_json_has_it_all(typed: Typed, capsys: pytest.CaptureFixture[str]) -> No
     assert msgspec.json.decode(text)["checked"] is False  # no keys: development mode
 
 
-def test_an_older_list_is_installed_only_when_asked(typed: Typed) -> None:
-    """It is refused with what counts; with --older it counts, also for a gateway that runs."""
+def test_an_older_list_is_not_installed(typed: Typed) -> None:
+    """It is refused with what counts and how to go back: signed again, the older one is the newest."""
     first = typed.sign(typed.list())
     old = typed.folder / "old.json"
     old.write_bytes(first.read_bytes())
@@ -112,9 +112,12 @@ def test_an_older_list_is_installed_only_when_asked(typed: Typed) -> None:
     typed("install", str(new), "--config", str(typed.config))
     assert counts.text == "parts 2"
     code, shown = typed("install", str(old), "--config", str(typed.config))
-    assert (code, "2 counts here" in shown) == (Exit.REFUSED, True)
-    assert typed("install", str(old), "--older", "--config", str(typed.config))[0] == Exit.DONE
-    assert counts.text == "parts 1"
+    assert (code, "2 counts here" in shown, "sign the older one again" in shown) == (Exit.REFUSED, True, True)
+    _, listed = typed("show", str(old), "--keys", str(typed.keys), "--json")
+    again = typed.folder / "again.json"
+    again.write_text(listed[listed.index("{") : listed.rindex("}") + 1])
+    assert typed("install", str(typed.sign(again)), "--config", str(typed.config))[0] == Exit.DONE
+    assert counts.text == "parts 3"
     assert not counts.problem
 
 
@@ -146,6 +149,6 @@ def test_a_strangers_list_is_not_installed(typed: Typed, tmp_path: Path) -> None
     stranger.sign_parts(parts.Parts(skill={"goto": ("0" * 64,)}), tmp_path / "theirs.json")
     (tmp_path / "cut.json").write_bytes(signed.read_bytes()[:-20])
     for name, why in (("theirs.json", "another authority"), ("cut.json", "damaged"), ("absent.json", "there is no")):
-        code, shown = typed("install", str(tmp_path / name), "--older", "--config", str(typed.config))
+        code, shown = typed("install", str(tmp_path / name), "--config", str(typed.config))
         assert (code, why in shown) == (Exit.DENIED, True)
     assert typed.check()[0] == Exit.DONE

@@ -96,21 +96,60 @@ def test_without_a_list_nothing_may_be_used(tmp_path: Path) -> None:
 
 
 def test_an_older_list_is_refused_also_after_a_restart(tmp_path: Path) -> None:
-    """The last one that counted is kept beside the data; an older one or a damaged one in its place changes nothing."""
+    """The last one that counted is kept with the data; an older one in the file's place, or none, changes nothing."""
     counts = in_force(tmp_path, parts.seal(listed(2), KEY))
     counts.check(Kind.SKILL, "goto", ONE)
+    counts.keep()
     old = parts.seal(Parts(fleet="yard", number=1, skill={"goto": (TWO,)}), KEY)
-    (tmp_path / parts.FILE).write_bytes(old)
-    with pytest.raises(IdentityError, match="not signed"):
-        counts.check(Kind.SKILL, "goto", TWO)
-    counts.check(Kind.SKILL, "goto", ONE)  # the one before still counts
-    assert "2 has counted here" in counts.problem
-    again = in_force(tmp_path, old)
-    with pytest.raises(IdentityError, match="2 has counted here"):
-        again.check(Kind.SKILL, "goto", TWO)
-    (tmp_path / "kept.json").write_bytes(old)  # what `install --older` does first
-    (tmp_path / parts.FILE).write_bytes(old + b"\n")
-    again.check(Kind.SKILL, "goto", TWO)
+    for again in (counts, in_force(tmp_path, old)):
+        (tmp_path / parts.FILE).write_bytes(old)
+        with pytest.raises(IdentityError, match="not signed"):
+            again.check(Kind.SKILL, "goto", TWO)
+        again.check(Kind.SKILL, "goto", ONE)  # the one before still counts
+        with pytest.raises(IdentityError, match="2 counts here already"):
+            again.take(old)
+        assert again.number == 2
+    (tmp_path / parts.FILE).unlink()
+    alone = InForce(tmp_path / parts.FILE, authority=KEY.public_key(), fleet="yard", kept=tmp_path / "kept.json")
+    assert (alone.number, alone.problem) == (2, "")
+
+
+def test_a_list_that_is_handed_on_counts_if_the_authority_signed_it(tmp_path: Path) -> None:
+    """Without a file beside the keys too, and over a restart; what is not good changes nothing, and says why."""
+    file, kept = tmp_path / parts.FILE, tmp_path / "kept.json"
+    counts = InForce(file, authority=KEY.public_key(), fleet="yard", kept=kept)
+    assert counts.number == 0
+    whole = parts.seal(listed(3), KEY)
+    for bad, reason in (
+        (parts.seal(listed(9), Ed25519PrivateKey.generate()), "another authority"),
+        (parts.seal(listed(9, fleet="mill"), KEY), "of fleet mill"),
+        (whole[:-9], "damaged"),
+        (b"", "damaged"),
+    ):
+        with pytest.raises(IdentityError, match=reason):
+            counts.take(bad)
+        assert counts.number == 0
+    counts.take(whole)
+    counts.take(whole)
+    counts.check(Kind.SKILL, "goto", ONE)
+    assert (counts.sealed, counts.problem) == (whole, "")
+    counts.keep()
+    again = InForce(file, authority=KEY.public_key(), fleet="yard", kept=kept)
+    assert again.number == 3
+    kept.write_bytes(b"{")  # a damaged one is as none
+    assert InForce(file, authority=KEY.public_key(), fleet="yard", kept=kept).number == 0
+
+
+def test_another_list_of_the_same_number_is_told(tmp_path: Path) -> None:
+    """As by an authority that was restored from an old backup: the one that counts stays, and the remedy is named."""
+    counts = in_force(tmp_path, parts.seal(listed(2), KEY))
+    other = parts.seal(Parts(fleet="yard", number=2, skill={"goto": (TWO,)}), KEY)
+    assert counts.number == 2
+    with pytest.raises(IdentityError, match="another of its number"):
+        counts.take(other)
+    (tmp_path / parts.FILE).write_bytes(other)
+    assert "another of its number" in counts.problem
+    counts.check(Kind.SKILL, "goto", ONE)
 
 
 def test_development_mode_says_so() -> None:
