@@ -64,7 +64,7 @@ class Param(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What its handler takes where a plan says nothing; None: nothing fixed. The safety policy looks at it."""
     least: float | None = None
     most: float | None = None
-    """Bounds of a number; a plan beyond them is refused."""
+    """Bounds of a number, or the fewest robots of a joint skill (2 where nothing is said); a plan beyond is refused."""
     names: Literal["", "place"] = ""
     """What a text names: a place of the site."""
     verbatim: bool = False

@@ -201,6 +201,12 @@ def _robot(subtask: Subtask, manifest: SkillManifest, roster: dict[str, RobotInf
                 yield from _named(name, manifest, roster)
         if len(set(names)) != len(names):
             yield "a robot is listed twice: list each once"
+        fewest = int(manifest.params["robots"].least or 2)
+        if manifest.runs == "robot" and names and len(names) < fewest and "all" not in names:
+            yield (
+                f"{manifest.id} is done by at least {fewest} robots together, and it lists {', '.join(names)} alone: "
+                "list every robot that takes part, or ask for a skill of one robot"
+            )
         if subtask.robot is not None and names and subtask.robot not in names:
             yield f"robot {shown(subtask.robot)} is not among its robots: list it first"
 

@@ -6,6 +6,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from appliance.llm.checks.places import locate
 from appliance.llm.checks.schema import MAX_PROBLEMS, MAX_SUBTASKS, validate
@@ -83,6 +84,10 @@ def test_good_plan_has_no_problems(catalogue: Catalogue, robots: tuple[RobotInfo
             Subtask(id="s1", skill="rendezvous", robot="rover_1", params={"robots": ["drone_1"], "place": "dock 1"}),
             "is not among its robots",
         ),
+        (
+            Subtask(id="s1", skill="rendezvous", robot="rover_1", params={"robots": ["rover_1"], "place": "dock 1"}),
+            "rendezvous is done by at least 2 robots together, and it lists rover_1 alone: list every robot",
+        ),
     ],
 )
 def test_each_problem_is_named(
@@ -95,13 +100,11 @@ def test_each_problem_is_named(
 
 def test_skill_without_handler_is_refused_when_required(catalogue: Catalogue) -> None:
     """A skill that has no handler is refused at planning time, and only where that was asked for."""
-    missing = next(skill for skill in catalogue.skills.values() if not skill.implemented and not skill.joint)
-    robot = "any" if missing.runs == "robot" else None
-    given = {name: "label" for name, param in missing.params.items() if param.required}
-    wanted = plan(Subtask(id="s1", skill=missing.id, robot=robot, params=given))
-    assert validate(wanted, catalogue) == ()
-    (problem,) = validate(wanted, catalogue, require_implemented=True)
-    assert f"skill {missing.id} is not implemented on this fleet" in problem
+    skills = {**catalogue.skills, "goto": replace(catalogue.skills["goto"], implemented=False)}
+    without = replace(catalogue, skills=skills)
+    assert validate(plan(goto()), without) == ()
+    (problem,) = validate(plan(goto()), without, require_implemented=True)
+    assert "skill goto is not implemented on this fleet" in problem
 
 
 def test_circle_is_named(catalogue: Catalogue) -> None:
