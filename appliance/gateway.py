@@ -292,7 +292,7 @@ class Gateway:
 
         await self._start_planner(catalogue)
 
-        self._stack.callback(self.plane.session.subscribe_typed(keyspace.RECORDER_STATUS, self._hear_recorder).close)
+        self._listen_to_recorders()
 
         audit = Audit(self.plane.session, self.plane.keys, config.id)
         self._stack.callback(audit.listen().close)
@@ -673,6 +673,19 @@ class Gateway:
         if self._observer is not None:
             self._observer.hear_log(line)
         self.plane.session.put(self.plane.keys(keyspace.LOG, self.config.id), msgspec.json.encode(line))
+
+    def _listen_to_recorders(self) -> None:
+        session, loop = self.plane.session, asyncio.get_running_loop()
+
+        def on_token(key: str, alive: bool) -> None:
+            (name,) = keyspace.RECORDER_ALIVE.names(key)
+            if alive:
+                self._recorders.there(name)
+            else:
+                loop.call_later(self._recorders.went(name, time.monotonic()) + 0.01, self._changed.set)
+
+        self._stack.callback(session.subscribe_typed(keyspace.RECORDER_STATUS, self._hear_recorder).close)
+        self._stack.callback(session.watch_alive(session.keys(keyspace.RECORDER_ALIVE), on_token).close)
 
     def _hear_recorder(self, _key: str, status: RecorderStatus | None) -> None:
         if status is not None and self._recorders.hear(status, time.monotonic()):

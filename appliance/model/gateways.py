@@ -151,7 +151,7 @@ class RecorderNote(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     id: str
     state: str = ""
-    """As in RecorderStatus, or `silent`: not heard for more than 5 s."""
+    """As in RecorderStatus, or `silent`: not heard any more, since it is gone or says nothing for more than 5 s."""
     problem: str = ""
     """Why it does not record; empty when it does."""
     going: str = ""

@@ -458,6 +458,16 @@ CLOSURE = Topic(
     puts=GATEWAYS,
     reads=WATCHERS,
 )
+RECORDER_ALIVE = Topic(
+    "recorder/{recorder}/alive",
+    Untyped,
+    form="token",
+    writer="that recorder",
+    often="while it records",
+    kept="gone with its process at once",
+    puts=GATEWAYS | {Role.RECORDER},
+    reads=WATCHERS,
+)
 RECORDER_STATUS = Topic(
     "recorder/{recorder}/status",
     recorder_api.RecorderStatus,

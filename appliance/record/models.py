@@ -114,6 +114,11 @@ def matches(expression: str, key: str) -> bool:
 MOST_RECORDERS = 8
 SILENT_S = 5.0
 """A recorder tells of itself every second; without word for so long something is wrong with it."""
+GONE_S = 1.25
+"""The same for one whose token is gone: its process ended, or the link to it was cut. A token alone says too little: it
+can get lost when a link is made again, and the recorder is still heard."""
+BACK_S = 0.3
+"""A token that is back so soon was never gone."""
 FORGET_S = 3600.0
 """One that was not heard for so long is not expected any more."""
 SILENT = "silent"
@@ -126,10 +131,30 @@ class Recorders:
 
     def __init__(self) -> None:
         self._heard: dict[str, tuple[RecorderStatus, float]] = {}
+        self._gone: dict[str, float] = {}
+        """Since when the token of each is gone, of those that were not heard since."""
+
+    def there(self, name: str) -> None:
+        """Take that a recorder's token is there."""
+        self._gone.pop(name, None)
+
+    def went(self, name: str, now: float) -> float:
+        """Take that a recorder's token is gone; returns in how many seconds its note is to be looked at again."""
+        if name not in self._heard:
+            return 0.0  # it stopped in good order, or never said anything
+        self._gone[name] = now
+        return max(0.0, self._silent_at(name) - now)
+
+    def _silent_at(self, name: str) -> float:
+        """Return from when on a recorder counts as silent, if nothing more is heard of it."""
+        heard_at = self._heard[name][1]
+        gone_at = self._gone.get(name)
+        return heard_at + SILENT_S if gone_at is None else max(heard_at + GONE_S, gone_at + BACK_S)
 
     def hear(self, status: RecorderStatus, now: float) -> bool:
         """Take a recorder's account of itself; whether anything of its note is new. One that stops is forgotten."""
         before = self.notes(now)
+        self._gone.pop(status.id, None)
         if status.state == "stopped":
             self._heard.pop(status.id, None)
         elif status.id in self._heard or len(self._heard) < MOST_RECORDERS:
@@ -141,7 +166,10 @@ class Recorders:
         gone = [name for name, (_, at) in self._heard.items() if now - at > FORGET_S]
         for name in gone:
             del self._heard[name]
-        return tuple(note_of(status, silent=now - at > SILENT_S) for _, (status, at) in sorted(self._heard.items()))
+            self._gone.pop(name, None)
+        return tuple(
+            note_of(status, silent=now > self._silent_at(name)) for name, (status, _) in sorted(self._heard.items())
+        )
 
 
 def note_of(status: RecorderStatus, *, silent: bool = False) -> RecorderNote:
@@ -173,8 +201,8 @@ def problem_of(note: RecorderNote) -> str:
     """Return what is wrong with a recorder, in one line; empty when nothing is."""
     parts: list[str] = []
     if note.state == SILENT:
-        parts.append(f"not heard for more than {SILENT_S:g} s")
-    elif note.problem:
+        parts.append("not heard any more")
+    if note.problem:
         parts.append(note.problem)
     if note.missed:
         parts.append(f"missed {note.missed:,} messages of keys {kinds_text(note.keys)}")

@@ -422,6 +422,7 @@ class Recorder:
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._subscription: Closer | None = None
+        self._token: Closer | None = None
         self._reporting: asyncio.Task[None] | None = None
         self._status = RecorderStatus(id=config.name, fleet=session.keys.fleet, started_ns=time.time_ns())
         self._lost_before: dict[str, int] = {}
@@ -443,6 +444,7 @@ class Recorder:
         self._subscription = await asyncio.to_thread(
             self._session.flood, self._session.keys.everything, LoggedMessage, self._catching_up.take
         )
+        self._token = self._session.declare_alive(self._session.keys(keyspace.RECORDER_ALIVE, self._config.name))
         self._reporting = asyncio.create_task(self._report(), name="recorder status")
         log.info("recorder started", directory=str(self._config.folder), fleet=self._session.keys.fleet)
 
@@ -471,6 +473,9 @@ class Recorder:
             )
         self._thread = None
         self._publish()
+        if self._token is not None:  # after the last word, by which it is known to stop in good order
+            self._token.close()
+            self._token = None
 
     def _run(self) -> None:
         try:
@@ -556,10 +561,15 @@ class Recorder:
         return tail_of(self._config.folder, prefix, keep_s=keep_s, now_ns=now_ns, but=before)
 
     async def _report(self) -> None:
+        step_s = min(_TICK_S, self._config.status_s)
         while True:
             self._look_for_losses()
             self._publish()
-            await asyncio.sleep(self._config.status_s)
+            said = self._status.state, self._status.problem
+            for _ in range(round(self._config.status_s / step_s)):
+                await asyncio.sleep(step_s)
+                if (self._status.state, self._status.problem) != said:
+                    break  # told at once
 
     def _publish(self) -> None:
         self._session.publish(keyspace.RECORDER_STATUS, self.stats, self._config.name)

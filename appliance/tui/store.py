@@ -32,6 +32,7 @@ from appliance.model.learn_api import LearnShown
 from appliance.model.learning import ClientStatus, RoundRecord, RunRecord
 from appliance.model.recorder_api import RecorderStatus
 from appliance.plane.dedup import Deduplicator
+from appliance.record.models import GONE_S, SILENT, SILENT_S, together
 from appliance.robots.authority.soft_stop import Stops
 from appliance.tui.safe import safe
 
@@ -157,9 +158,6 @@ ROBOTS = 5000
 CONTAINERS = 20_000
 RECORDERS = 20
 """Most recorders remembered."""
-RECORDER_SILENT_S = 5.0
-"""A recorder reports every second; silent for so long, it has a problem."""
-SILENT = "silent"
 ENQUIRIES = 200
 ALERTS = 2000
 RUNS = 200
@@ -422,10 +420,16 @@ class Store:
             self.recorders.put(status.id, status)
 
     def listen_for_silence(self, now: float) -> None:
-        """Mark recorders that were not heard for a while; nothing comes of them that would do so."""
+        """Mark recorders that were not heard for a while; nothing comes of them that would do so.
+
+        Gateways know of one whose process ended before it is missed here.
+        """
+        told = together(note for each in self.gateways.values() if not each.lost_ns for note in each.status.recorders)
+        gone = {note.id for note in told if note.state == SILENT}
         for name, heard_at in self._heard.items():
             status = self.recorders.get(name)
-            if status is not None and status.state != SILENT and now - heard_at >= RECORDER_SILENT_S:
+            patience_s = GONE_S if name in gone else SILENT_S
+            if status is not None and status.state != SILENT and now - heard_at >= patience_s:
                 self.recorders.put(name, structs.replace(status, state=SILENT))
 
     def take_stops(self, stops: Iterable[SoftStop] = (), lifted: Iterable[Lifted] = ()) -> None:

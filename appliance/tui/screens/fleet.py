@@ -25,14 +25,14 @@ from appliance.model import ContainerInfo, GatewayStatus, Phase, SubtaskState
 from appliance.model.pool_api import PoolDecision
 from appliance.model.recorder_api import RecorderStatus
 from appliance.reasons import time_of_day
-from appliance.record.models import kinds_text
+from appliance.record.models import SILENT, kinds_text
 from appliance.tui import status_styles
 from appliance.tui.actions import bindings
 from appliance.tui.base_screen import FleetScreen
 from appliance.tui.command_line import plain_image
 from appliance.tui.formatting import Cell, age, bar, counted, hanging, milliseconds, sparkline
 from appliance.tui.safe import safe
-from appliance.tui.store import SILENT, Gateway, Start, Store
+from appliance.tui.store import Gateway, Start, Store
 from appliance.tui.widgets.grid import Column, Grid
 
 

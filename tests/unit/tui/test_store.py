@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.model import GatewayStatus, RunEvent, RunEventKind, TaskRecord, TaskState
+from appliance.model import GatewayStatus, RecorderNote, RunEvent, RunEventKind, TaskRecord, TaskState
 from appliance.model.recorder_api import RecorderStatus
 from appliance.tui.store import Connection, Shelf, Store
 
@@ -51,6 +51,17 @@ def test_recorder_falls_silent() -> None:
     assert states["r0"] == "silent"
     assert states["r1"] == "recording"
     assert "r2" not in states
+
+
+def test_recorder_that_gateways_know_to_be_gone() -> None:
+    """It is silent as soon as all gateways say so, unless it was heard a moment ago."""
+    store = Store(tasks=1, entries=1)
+    for name, heard_at in (("r0", 100.0), ("r1", 101.5)):
+        store.take_recorder(RecorderStatus(id=name, fleet="f", state="recording"), now=heard_at)
+    notes = (RecorderNote(id="r0", state="silent"), RecorderNote(id="r1", state="silent"))
+    store.take_gateways({"gw-1": GatewayStatus(id="gw-1", fleet="f", recorders=notes)}, now_ns=1)
+    store.listen_for_silence(102.0)
+    assert {status.id: status.state for status in store.recorders.values()} == {"r0": "silent", "r1": "recording"}
 
 
 @settings(deadline=None)
