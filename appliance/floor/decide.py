@@ -6,6 +6,7 @@ Rules, in the order in which they are looked at:
    lower ticket goes first. Robots of one task may share a place, side by side: its plan has ordered them.
 2. A robot that stands keeps the ground under it, whether it has a task or not. Ways lead round it where there is room.
    One that moves without a reservation (by hand, by a pilot, unknown) has the ground that it can reach in `HAND_S` too.
+   One that is lost keeps what was left of its way too, until it is heard again or forgotten.
 3. A way is reserved before its robot moves, and freed behind it (`geometry.cells`). Where others move or want to on it,
    it is cut into stretches: each ends where the robot blocks no other's way, about `STRETCH_M` further on or behind
    what it would block, and is reserved as a whole, so that a robot never stops in an aisle that another wants to pass.
@@ -44,6 +45,8 @@ APART_M = 0.1
 """Between robots side by side, beside their margins."""
 DETOUR, DETOUR_M = 1.6, 4.0
 """A way round a robot that moves is taken when it is at most so many times, and metres, longer."""
+LOST_M = 3.0
+"""A robot that was lost on its way may still have so much reserved behind it."""
 STRETCH_M = 10.0
 """So much of a way is reserved at a time, where a robot can stop so early without blocking another."""
 SHORTEST_M = 2.0
@@ -77,6 +80,17 @@ class Body(Struct, frozen=True, kw_only=True):
     def moved(self) -> bool:
         """Whether a run moves it under a reservation."""
         return self.state is not None and self.state.state == "moves"
+
+    @property
+    def lost(self) -> bool:
+        """Whether it is not heard, and no gateway says that it moves it."""
+        return not self.fresh and not self.moved
+
+    @property
+    def bound(self) -> tuple[Point, ...]:
+        """The way that it has reserved, also when it was lost on it."""
+        state = self.state
+        return state.way if state is not None and state.state != "waits" and (self.moved or self.lost) else ()
 
     @property
     def waiting(self) -> FloorState | None:
@@ -186,7 +200,10 @@ class Floor:
             way = straight if all(_clear(straight, each, me) for each in standing) else None
         else:
             walls = [wall for each in standing if (wall := _wall(each, me)) is not None]
-            way = self._route(me, points, walls, trip.flies)
+            lost = _walls_of_lost(standing, me)
+            way = self._route(me, points, [*walls, *lost], trip.flies) if lost else None
+            # Where there is no way round them, those who grant know what a lost robot still has reserved.
+            way = way or self._route(me, points, walls, trip.flies)
             if way is not None and avoid:
                 way = self._round(me, points, walls, [bodies[each] for each in avoid if each in bodies], trip) or way
         if way is None and not standing:
@@ -195,6 +212,9 @@ class Floor:
             nearest = min(standing, key=lambda each: geometry.from_way(each.at[:2], straight))
             return Wait(robot=nearest.robot, why=_moves(nearest), place=place, way=straight)
         whole = _go(way, me.size, place=place)
+        # Who stands on ground that a lost robot has reserved may leave it.
+        here = geometry.cells((me.at,), me.size) & _cells_of_lost(others)
+        whole = replace(whole, parts=whole.parts - here)
         if place and self.capacity[place] == 1 and goal[:2] == self._centre(place):
             whole = replace(whole, parts=whole.parts | {f"place/{place}"})
         step = self._stretch(whole, trip, me, others)
@@ -271,7 +291,8 @@ class Floor:
         """Return whom to wait for, and why, where another has reserved a part of the way."""
         other, place = bodies.get(holder), part.removeprefix("place/")
         if ended and (other is None or not other.fresh):
-            why = f"waits for {holder}, which was lost on its way here"
+            where = "on its way here" if other is None or other.bound else "in the way"
+            why = f"waits for {holder}, which was lost {where}: {remedy_of_lost(holder)}"
         elif ended:
             why = f"waits for {holder} to stand still"
         elif place != part:
@@ -312,13 +333,16 @@ class Floor:
                 first_in_line = min(before, key=lambda each: each.ticket)
                 why = f"waits for {place}, after {first_in_line.robot}"
                 return Wait(robot=there[0].robot if there else "", why=why, place=place, way=way, in_line=True)
-        taken = [
-            (each.state.way[-1] if each.moved and each.state and each.state.way else each.at, each.size.kept_m)
-            for each in others
+        taken = [(each.bound[-1] if each.bound else each.at, each.size.kept_m) for each in others]
+        spots = [
+            (*spot, goal[2])
+            for spot in self._spots(place, me.size, max(capacity, 1 + len(there)))
+            if all(math.dist(spot, end[:2]) >= me.size.kept_m + kept for end, kept in taken)
         ]
-        for spot in self._spots(place, me.size, max(capacity, 1 + len(there))):
-            if all(math.dist(spot, end[:2]) >= me.size.kept_m + kept for end, kept in taken):
-                return (*spot, goal[2])
+        if spots:
+            lost = _walls_of_lost(others, me)
+            off = (spot for spot in spots if all(wall.gap(spot[:2]) >= me.size.kept_m for wall in lost))
+            return next(off, spots[0])
         near = min(others, key=lambda each: math.dist(each.at[:2], self._centre(place)))
         return Wait(robot=near.robot, why=_leaves(near, near.robot, place), place=place, way=way, in_line=True)
 
@@ -329,22 +353,23 @@ class Floor:
     def _takes(self, place: str, body: Body) -> bool:
         """Whether a robot is at a place, or has it reserved."""
         end = body.at
-        if body.moved and body.state is not None and body.state.way:
+        if body.bound and body.state is not None:
             if body.state.place == place:
                 return True
-            end = body.state.way[-1]
+            end = body.bound[-1]
         if end[2] > PLACE_M:
             return False
         return math.dist(end[:2], self._centre(place)) <= (PLACE_M if self.capacity[place] == 1 else SIDE_M)
 
     def _spots(self, place: str, size: Size, count: int) -> Iterable[Flat]:
-        """Yield spots to stand at a place: its centre, then round it."""
+        """Yield spots to stand at a place: its centre, round it, and off the cells of a lost robot there."""
         x, y = self._centre(place)
         yield x, y
-        ring = 2 * size.kept_m + 3 * APART_M  # a robot arrives within some centimetres
         angles = [math.tau * turn / 6 for turn in range(6)]
-        round_it = [(round(x + ring * math.sin(each), 3), round(y + ring * math.cos(each), 3)) for each in angles]
-        yield from [spot for spot in round_it if self._open(spot, size)][: count - 1]
+        near = 2 * size.kept_m + 3 * APART_M  # a robot arrives within some centimetres
+        for ring, most in ((near, count - 1), (2 * size.kept_m + 1.5 * geometry.CELL_M, 6 * (count > 1))):
+            round_it = [(round(x + ring * math.sin(each), 3), round(y + ring * math.cos(each), 3)) for each in angles]
+            yield from [spot for spot in round_it if self._open(spot, size)][:most]
 
     def _open(self, spot: Flat, size: Size) -> bool:
         fence = self.site.fence
@@ -469,8 +494,9 @@ def _go(way: tuple[Point, ...], size: Size, *, place: str = "") -> Go:
 def _cut(go: Go, metres: float, size: Size) -> Go:
     """Return the first stretch of a way; the place at its end is reserved with the last one."""
     way = geometry.ahead(go.way, metres)
+    first = _go(way, size, place=go.place)
     # `ahead` ends with a point of its own, on the leg to this one.
-    return replace(_go(way, size, place=go.place), wants=(*go.way[len(way) - 1 :], *go.wants))
+    return replace(first, parts=first.parts & go.parts, wants=(*go.way[len(way) - 1 :], *go.wants))
 
 
 def _wanted(body: Body) -> tuple[Point, ...]:
@@ -519,6 +545,26 @@ def _wall(body: Body, me: Body) -> paths.Rectangle | None:
     return paths.Rectangle(body.robot, x - half, x + half, y - half, y + half)
 
 
+def _walls_of_lost(bodies: Iterable[Body], me: Body) -> list[paths.Rectangle]:
+    """Return the cells that lost robots may still have reserved, but for those that `me` is in: it can leave."""
+    return [
+        wall
+        for each in bodies
+        if each.lost
+        for edges in geometry.covered(_left_of(each), each.size)
+        if not (wall := paths.Rectangle(each.robot, *edges)).holds(me.at[:2])
+    ]
+
+
+def _left_of(body: Body) -> tuple[Point, ...]:
+    """Return what is left of the way that a robot was lost on, and a bit behind it; else where it stands."""
+    return (body.at, *geometry.rest(body.bound, body.at[:2], 0, LOST_M)[1]) if body.bound else (body.at,)
+
+
+def _cells_of_lost(bodies: Iterable[Body]) -> frozenset[str]:
+    return frozenset[str]().union(*(geometry.cells(_left_of(each), each.size) for each in bodies if each.lost))
+
+
 def _walls_along(way: Sequence[Point], size: Size) -> list[paths.Rectangle]:
     """Return rectangles that cover a reserved way."""
     walls: list[paths.Rectangle] = []
@@ -548,12 +594,20 @@ def _heights_meet(way: Sequence[Point], size: Size, body: Body) -> bool:
     """Whether a robot is in a band of height that another goes through."""
     heights = [each[2] for each in way]
     low, high = geometry.bands(min(heights), max(heights), size)
-    theirs = [body.at[2], *(each[2] for each in body.state.way)] if body.moved and body.state else [body.at[2]]
+    theirs = [body.at[2], *(each[2] for each in body.bound)]
     other_low, other_high = geometry.bands(min(theirs), max(theirs), body.size)
     return low <= other_high and other_low <= high
 
 
+def remedy_of_lost(robot: str) -> str:
+    """Return what helps against a lost robot in the way."""
+    return f"find it, or `swiftbot robots forget {robot}` when it is gone for good"
+
+
 def _leaves(body: Body | None, robot: str, place: str) -> str:
+    if body is not None and body.lost:
+        where = "on its way to" if body.bound else "at"
+        return f"waits for {robot}, which was lost {where} {place}: {remedy_of_lost(robot)}"
     if body is not None and body.moved and body.state is not None and body.state.place == place:
         return f"waits for {robot}, which goes to {place}"
     return f"waits for {robot} to leave {place}{_itself(body)}"
@@ -563,7 +617,7 @@ def _moves(body: Body) -> str:
     if not body.stands:
         return f"waits for {body.robot}, which moves without a reservation"
     if not body.fresh:
-        return f"waits for {body.robot}, which is not heard of and was in the way"
+        return f"waits for {body.robot}, which was lost in the way: {remedy_of_lost(body.robot)}"
     return f"waits for {body.robot} to move out of the way{_itself(body)}"
 
 

@@ -44,6 +44,16 @@ def cells(way: Sequence[Point], size: Size) -> frozenset[str]:
     return frozenset(found)
 
 
+def covered(way: Sequence[Point], size: Size) -> Iterable[tuple[float, float, float, float]]:
+    """Yield rectangles (x0, x1, y0, y1), metres, that the cells of a way make up, a row of a leg each."""
+    for start, end in list(pairwise(way)) or [(way[0], way[0])]:
+        rows: dict[int, list[int]] = {}
+        for column, row in _flat_cells(start[:2], end[:2], size.kept_m):
+            rows.setdefault(row, []).append(column)
+        for row, columns in rows.items():
+            yield min(columns) * CELL_M, (max(columns) + 1) * CELL_M, row * CELL_M, (row + 1) * CELL_M
+
+
 def sweep(way: Sequence[Point], size: Size) -> tuple[tuple[float, frozenset[str]], ...]:
     """Return the cells of a way piece by piece, each with the metres along the way at which it ends."""
     pieces: list[tuple[float, frozenset[str]]] = []

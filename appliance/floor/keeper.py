@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from appliance.background import Background
 from appliance.errors import RobotError, SwiftbotError
 from appliance.floor import geometry
-from appliance.floor.decide import PLACE_M, Body, Floor, Go, Trip, Wait
+from appliance.floor.decide import PLACE_M, Body, Floor, Go, Trip, Wait, remedy_of_lost
 from appliance.floor.mover import Mover
 from appliance.floor.settings import FloorConfig
 from appliance.floor.sight import Sight
@@ -313,9 +313,11 @@ class _Drive:
         self._note(wait.why)
         self._keeper.tell(self._mover, self._command.id)
         if self._waited_s >= self._keeper.wait_s:
+            other = self._keeper.bodies().get(wait.robot)
+            elsewhere = f"order {wait.robot or 'what is in the way'} elsewhere, or raise floor.wait_s"
             raise RobotError(
                 f"{self._robot} waited {self._waited_s:.0f} s and did not get its way: it {wait.why}",
-                remedy=f"order {wait.robot or 'what is in the way'} elsewhere, or raise floor.wait_s",
+                remedy=remedy_of_lost(wait.robot) if other is not None and other.lost else elsewhere,
             )
         began = time.monotonic()
         await asyncio.sleep(RETRY_S)

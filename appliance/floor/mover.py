@@ -161,7 +161,7 @@ def _signature(trip: Trip, bodies: Mapping[str, Body], avoid: tuple[str, ...]) -
             each.stands,
             each.fresh,
             each.state.state if each.state is not None else "",
-            (each.state.way, each.state.wants) if each.moved and each.state is not None else (),
+            (each.bound, each.state.wants) if each.bound and each.state is not None else (),
             (
                 waiting.place,
                 waiting.ticket,

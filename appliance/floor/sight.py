@@ -90,7 +90,8 @@ class Sight:
             return None
         state, heard = found
         if state.state != "stands" and now - heard > STATE_S:
-            return replace(state, state="stands", waits_for="", why="", ticket=0)
+            reserved = state.way if state.state == "moves" else ()
+            return replace(state, state="stands", way=reserved, waits_for="", why="", ticket=0)
         return state
 
     def states(self, now: float) -> tuple[FloorState, ...]:

@@ -21,7 +21,6 @@ from msgspec.structs import replace
 from appliance.client import FleetClient
 from appliance.config import GatewayConfig
 from appliance.connection import FleetState
-from appliance.floor.settings import FloorConfig
 from appliance.llm.settings import LlmConfig
 from appliance.model import Plan, RevisionKind, Subtask, SubtaskState, TaskRecord, TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
@@ -179,8 +178,6 @@ async def up(tmp_path: Path, upstream: Upstream) -> AsyncIterator[Up]:
             skills=(str(skills),),
             llm=LlmConfig(tiers=("upstream", "rules"), upstream_url=upstream.url, upstream_model="big"),
             tasks=TasksConfig(check_s=0.5, replan=ReplanConfig(robot_wait_s=1.0)),
-            # A lost robot keeps its ground, and who stands in for it would wait until it is found or forgotten.
-            floor=FloorConfig(enabled=False),
         )
         order = Order(
             fleet=f"r{os.getpid()}-{time.monotonic_ns() % 100000}",
@@ -326,7 +323,7 @@ async def test_whoever_watches_may_leave_and_the_task_goes_on(up: Up) -> None:
 
 @pytest.mark.long
 async def test_another_robot_takes_over_from_one_that_goes_offline(up: Up) -> None:
-    """The robot that films is killed: the other one goes to the place first, and films there."""
+    """The robot that films is killed and keeps its ground: the other goes to the place, stands beside it, and films."""
     state = await up(zenoh=2, sim_rate=4.0, pool=PoolConfig(floor={"base": 1, "vision": 1}))
     async with FleetClient(state.endpoint) as client:
         accepted = await client.submit(

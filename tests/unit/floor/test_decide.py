@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from appliance.floor.decide import Body, Floor, Go, Trip, Wait, next_ticket, threat
+from appliance.floor.decide import Body, Floor, Go, Trip, Wait, next_ticket, remedy_of_lost, threat
 from appliance.floor.geometry import Size
 from appliance.floor.mover import Mover
 from appliance.model import Box, Place, Site
@@ -171,7 +171,10 @@ def test_a_refusal_is_put_in_words() -> None:
     seen = bodies(body("b", 3.0, 3.0, moving), body("c", 9.0, 9.0, fresh=False))
     assert FLOOR.refused(go, "b", "place/dock 1", seen, ended=False).why == "waits for b, which goes to dock 1"
     assert FLOOR.refused(go, "b", "0,1,2", seen, ended=False).why == "waits for b to pass"
-    assert FLOOR.refused(go, "c", "0,1,2", seen, ended=True).why == "waits for c, which was lost on its way here"
+    lost = FLOOR.refused(go, "c", "0,1,2", seen, ended=True).why
+    assert lost == f"waits for c, which was lost in the way: {remedy_of_lost('c')}"
+    lost = FLOOR.refused(go, "d", "0,1,2", seen, ended=True).why
+    assert lost == f"waits for d, which was lost on its way here: {remedy_of_lost('d')}"
 
 
 def test_what_is_passed_is_not_gone_to_again() -> None:

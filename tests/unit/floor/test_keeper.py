@@ -166,6 +166,15 @@ async def test_it_waits_with_the_reason_and_fails_with_it(floor: FloorKeeper, fl
     assert fleet.notes[0] == "waits for b to leave dock 1"
 
 
+async def test_it_waits_for_a_lost_robot_with_the_remedy(floor: FloorKeeper, fleet: Fake) -> None:
+    """The note while it waits, and the error at the end, name the command that forgets it."""
+    fleet.put("b", 10.2, online=False)
+    with pytest.raises(RobotError, match="lost at dock 1") as failed:
+        await drive(floor, fleet, goto(10.0))
+    assert "`swiftbot robots forget b`" in failed.value.remedy
+    assert "`swiftbot robots forget b`" in fleet.notes[0]
+
+
 async def test_it_goes_when_the_other_has_left(floor: FloorKeeper, fleet: Fake) -> None:
     """Without being told to."""
     fleet.put("b", 10.2)
