@@ -17,14 +17,15 @@ from appliance.background import Background
 from appliance.errors import RobotError, SwiftbotError
 from appliance.floor import geometry
 from appliance.floor.decide import PLACE_M, Body, Floor, Go, Trip, Wait, remedy_of_lost
+from appliance.floor.decisions import NAME, Refusal, WayCase, begun, decided, map_of
 from appliance.floor.mover import Mover
 from appliance.floor.settings import FloorConfig
 from appliance.floor.sight import Sight
 from appliance.floor.trips import goto_args, trip_of
-from appliance.model import RobotCommand, RobotReply, Site, keyspace
+from appliance.model import RobotCommand, RobotReply, Site, encode, keyspace
 from appliance.model.floor import FloorState, Point
 from appliance.model.plane_api import MOST_PARTS
-from appliance.plane.leases import Claim, Lease
+from appliance.plane.leases import Claim, GrantCase, Lease
 from appliance.plane.node import Plane
 
 log = structlog.get_logger(__name__)
@@ -80,11 +81,14 @@ class FloorKeeper:
         self._takeoff_m = takeoff_m
         self._hindrance = hindrance
         self.floor = Floor(site)
+        self.map = map_of(site)
         self.sight = Sight(config)
         self._seen: dict[str, object] = {}
         """What was observed last of each robot, to tell news from what is known."""
         self._moving: dict[str, tuple[Mover, str]] = {}
         """The commands in progress here by robot, with the id of what was sent."""
+        self._told: dict[str, tuple[object, ...]] = {}
+        """What was put last of each robot's refusals and waits: the same is not put again."""
         self._said_at = 0.0
         self._background = Background()
         self._work: asyncio.Task[None] | None = None
@@ -108,6 +112,8 @@ class FloorKeeper:
             for problem in self.floor.problems(self._config.radius_m):
                 log.warning("the site's map", problem=problem, remedy="correct the places in the site's file")
         session = self._plane.session
+        if self._config.tell_decisions and self._voters:
+            self._plane.leases.tell(self._tell_grant)
 
         def gone(message_key: str, deleted: bool) -> None:
             if deleted:
@@ -168,6 +174,23 @@ class FloorKeeper:
         state = mover.state(self._plane.gateway, command, time.monotonic())
         self.sight.hear(state, time.monotonic())
         self._plane.session.publish(keyspace.FLOOR, state, robot)
+
+    def tell_way(self, case: WayCase) -> None:
+        """Put a decision for the log, unless it is to wait for the same as before."""
+        news = (case.waits_for, case.why, case.way[-1:])
+        if self._config.tell_decisions and not (case.why and self._told.get(case.trip.robot) == news):
+            self._tell(NAME, case)
+        self._told[case.trip.robot] = news
+
+    def _tell_grant(self, case: GrantCase) -> None:
+        name, news = f"grant/{case.asked.holder}", (case.holder, case.part)
+        if case.asked.key == KEY and (case.granted or self._told.get(name) != news):
+            self._tell("grant", case)
+        self._told[name] = news
+
+    def _tell(self, what: str, case: WayCase | GrantCase) -> None:
+        session = self._plane.session
+        session.put(session.keys(keyspace.DECIDED, self._plane.gateway, what), encode(case))
 
     # --- one command ------------------------------------------------------------------------------------------
 
@@ -355,23 +378,22 @@ class _Drive:
     async def _reserve(self) -> Go | Wait:
         mover, keeper = self._mover, self._keeper
         mover.begin()
-        step: Go | Wait | None = None
-        while True:
-            bodies, now = keeper.bodies(), time.monotonic()
-            step = step or mover.ask(bodies, now)
-            if isinstance(step, Wait):
-                return step
+        bodies, now = keeper.bodies(), time.monotonic()
+        case, refusals = begun(mover, keeper.map, bodies.values(), now), list[Refusal]()
+        step: Go | Wait = mover.ask(bodies, now)
+        while isinstance(step, Go):
             try:
                 claim = await keeper.claim(self._robot, step.parts)
             except SwiftbotError as error:
                 return Wait(robot="", why=f"waits for the gateways that grant ways: {error.message}", way=step.way)
             if claim.lease is not None:
                 self._lease = claim.lease
-                return step
+                break
+            refusals.append(Refusal(claim.holder, claim.part, claim.ended))
             after = mover.refused(step, claim.holder, claim.part, bodies, now, ended=claim.ended)
-            if isinstance(after, Wait):
-                return after
-            step = after
+            step = after or mover.ask(bodies, now)
+        keeper.tell_way(decided(case, step, refusals))
+        return step
 
     def _body(self) -> Body:
         """Return the robot as it is seen; RobotError when an operator has it forgotten meanwhile."""

@@ -31,9 +31,11 @@ class Mover:
         self.stuck = False
         self._floor = floor
         self._leg = 0
-        self._since: float | None = None
+        self.since: float | None = None
+        """When it began to wait."""
         self._avoid: tuple[str, ...] = ()
-        self._looked = -DETOUR_S
+        self.looked = -DETOUR_S
+        """When it looked for a way round others last."""
         self._decided: dict[tuple[Any, ...], Go | Wait] = {}
         """Decisions on what is seen at present: a search for a way takes tens of milliseconds."""
         self._seen: tuple[Any, ...] = ()
@@ -64,13 +66,13 @@ class Mover:
             return nearer
         wait = self._floor.refused(go, holder, part, bodies, ended=ended)
         again = not (go.yields or self.trip.fixed or wait.in_line or self._avoid) and holder in bodies
-        if again and now - self._looked >= DETOUR_S:
-            self._avoid, self._looked = (holder,), now
+        if again and now - self.looked >= DETOUR_S:
+            self._avoid, self.looked = (holder,), now
             return None
         return self._waits(wait, bodies, now, may_yield=not go.yields)
 
     def _waits(self, wait: Wait, bodies: Mapping[str, Body], now: float, *, may_yield: bool = True) -> Go | Wait:
-        since = self._since = now if self._since is None else self._since
+        since = self.since = now if self.since is None else self.since
         if not self.trip.ticket:
             self.trip = replace(self.trip, ticket=next_ticket(bodies.values()))
         self.wait = wait
@@ -87,7 +89,7 @@ class Mover:
         """Note that it has a way reserved, and goes."""
         self.go, self.wait, self.stuck, self._leg, self.place = go, None, False, 0, go.place
         if go.ends:
-            self._since = None
+            self.since = None
 
     def stopped(self, at: Point) -> None:
         """Note that it was stopped on its way: it goes on from there."""
@@ -146,7 +148,7 @@ class Mover:
             waits_for=wait.robot if wait is not None and go is None else "",
             why=wait.why if wait is not None and go is None else "",
             ticket=trip.ticket,
-            waited_s=round(now - self._since, 1) if self._since is not None and go is None else 0.0,
+            waited_s=round(now - self.since, 1) if self.since is not None and go is None else 0.0,
             in_line=wait is not None and wait.in_line,
             stuck=self.stuck,
         )

@@ -33,6 +33,9 @@ class FloorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Sizes of single robots, by name."""
     wait_s: float = 300.0
     """A command waits so long for a place or a way, then it fails with the reason."""
+    tell_decisions: bool = True
+    """Put each way that is reserved, each new reason to wait and each grant with all that it rested on, so that
+    `swiftbot log check` can make it again: some 10 kB for each stretch of a way, more with many robots."""
 
     def check(self) -> None:
         """Raise ConfigError for sizes and times that cannot be."""

@@ -168,11 +168,12 @@ DECIDED = Topic(
     "gw/{gateway}/decided/{what}",
     task_api.Decided,
     "a decision with all that it rests on: `placement` (PlacementCase, by the coordinator, when a subtask is sent), "
-    "`selection` (SelectionCase) and `eviction` (EvictionCase, by the pool), `round` (RoundCase, by the coordinator of "
-    "a round of federated learning)",
+    "`selection` (SelectionCase) and `eviction` (EvictionCase, by the pool), `way` (WayCase, by the gateway that moves "
+    "a robot) and `grant` (GrantCase, by one that grants ways), `round` (RoundCase, by the coordinator of a round of "
+    "federated learning)",
     writer="that gateway",
-    often="about 1 kB a run each, and each step of a round; not with `tasks.tell_decisions`, `pool.tell_decisions` = "
-    "false",
+    often="about 1 kB a run each, and each step of a round, some 10 kB a stretch of a robot's way; not with "
+    "`tasks.tell_decisions`, `pool.tell_decisions`, `floor.tell_decisions` = false",
     kept="in logs only, for `swiftbot log check`",
     puts=GATEWAYS,
     reads=WATCHERS,

@@ -573,7 +573,7 @@ class ActList(Struct, frozen=True, kw_only=True):
 
 
 class Decided(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What the published decisions of a gateway have in common: `placement`, `selection`, `eviction`, `round`."""
+    """What the published decisions of a gateway have in common: `placement`, `selection`, `eviction`, `way`, ..."""
 
     task: str = ""
     subtask: str = ""

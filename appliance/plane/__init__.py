@@ -4,8 +4,9 @@ Doors: `node.Plane` (a gateway's part in the fleet), `client.PlaneClient` (every
 links a large fleet), with `settings` and `events` (the fleet's, in one order). What they are made of is used where less
 will do: `session.Session` with `session.Closer`, `session.Message` and `session.Publisher`, `rpc.Rpc`, `dht.Dht` with
 `dht.Record` and `dht.LeaveOut`, `records` (their versions), `store.Store`, `dedup.Deduplicator`, and `backlog` (for
-recorders). What a majority grants is a `leases.Lease`, or of parts of a key a `leases.Claim`. A backup
-copies the store's file (`node.STORE_FILE`), and a restore raises its fence (`leases.FENCE`).
+recorders). What a majority grants is a `leases.Lease`, or of parts of a key a `leases.Claim`; answers on parts can be
+made again from a log (`leases.GrantCase`, `leases.grant_again`). A backup copies the store's file (`node.STORE_FILE`),
+and a restore raises its fence (`leases.FENCE`).
 
 From below:
 

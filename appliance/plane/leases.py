@@ -63,6 +63,49 @@ class Grant(Struct, frozen=True):
         return not asked.parts or not self.parts or not self.parts.isdisjoint(asked.parts)
 
 
+class GrantCase(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """An answer on parts of a key with all that it rested on, put as `gw/{gateway}/decided/grant`."""
+
+    gateway: str
+    asked: LeaseAsk
+    now: float
+    """Seconds of the grantor's own clock."""
+    before: int
+    """Its highest fence."""
+    held: tuple[Grant, ...]
+    """What the asker's holder has, and what others have of what is asked for."""
+    granted: bool = False
+    holder: str = ""
+    """Where it is refused: who has a part of it."""
+    part: str = ""
+    twice: str = ""
+    """Who else has a part of what was granted, under a lease that has not ended: must be nobody."""
+
+
+def case_of(grantor: "Grantor", gateway: str, asked: LeaseAsk, now: float) -> GrantCase:
+    """Return what an answer will rest on."""
+    wanted = frozenset(asked.parts)
+    others = [replace(each, parts=each.parts & wanted, before=None) for each in grantor.held(asked.key)]
+    held = [each for each in others if each.parts and each.holder != asked.holder]
+    mine = [replace(each, before=None) for each in grantor.held(asked.key) if each.holder == asked.holder]
+    return GrantCase(gateway=gateway, asked=asked, now=now, before=grantor.fence, held=(*mine, *held))
+
+
+def answered(case: GrantCase, answer: Granted) -> GrantCase:
+    """Return a case with the answer that was given."""
+    live = (each.holder for each in case.held if each.holder != case.asked.holder and each.until > case.now)
+    twice = next(live, "") if answer.granted else ""
+    return replace(case, granted=answer.granted, holder=answer.holder, part=answer.part, twice=twice)
+
+
+def grant_again(case: GrantCase) -> dict[str, object]:
+    """Answer again; the answer by the fields of the case."""
+    grantor = Grantor(fence=0, now=case.now)
+    grantor.restore(case.asked.key, case.held, case.before)
+    found = answered(case, grantor.grant(case.asked, case.now))
+    return {"granted": found.granted, "holder": found.holder, "part": found.part, "twice": ""}
+
+
 class Grantor:
     """The grants of one gateway.
 
@@ -77,6 +120,15 @@ class Grantor:
         self._quiet_until = now + LONGEST_S if fence else now
         self._grants: dict[str, dict[str, Grant]] = {}
         """By key and holder."""
+
+    def held(self, key: str) -> tuple[Grant, ...]:
+        """Return what is granted of a key, ended leases on parts among it."""
+        return tuple(self._grants.get(key, {}).values())
+
+    def restore(self, key: str, held: Sequence[Grant], fence: int) -> None:
+        """Take up what was granted of a key, to answer once more as then."""
+        self._grants[key] = {each.holder: each for each in held}
+        self.fence = fence
 
     def grant(self, asked: LeaseAsk, now: float) -> Granted:
         """Grant a key, also again to its holder, unless another has it or the fence is not higher than any before.
@@ -238,6 +290,7 @@ class Leases:
         self._grantor: Grantor | None = None
         self._highest = 0
         """Highest fence heard of."""
+        self._told: Callable[[GrantCase], None] | None = None
         rpc.register(keyspace.LEASE_GRANT, self.on_grant)
         rpc.register(keyspace.LEASE_RELEASE, self.on_release)
 
@@ -255,6 +308,10 @@ class Leases:
             )
 
     # --- the door ---------------------------------------------------------------------------------------------
+
+    def tell(self, told: Callable[[GrantCase], None]) -> None:
+        """Have each answer on parts told, but for renewals."""
+        self._told = told
 
     def grantors(self, key: str) -> tuple[str, ...]:
         """The gateways that grant a key, there or not; ConfigError when none are configured."""
@@ -446,10 +503,14 @@ class Leases:
 
     async def on_grant(self, asked: LeaseAsk) -> Granted:
         """Grant, with the fence on the disk before the answer."""
-        grantor = self._granting(asked)
-        answer = grantor.grant(asked, time.monotonic())
+        grantor, now = self._granting(asked), time.monotonic()
+        told = self._told if asked.parts and not asked.after else None
+        case = case_of(grantor, self._gateway, asked, now) if told is not None else None
+        answer = grantor.grant(asked, now)
         if answer.granted:
             await self._store.put(FENCE, str(grantor.fence).encode())
+        if told is not None and case is not None:
+            told(answered(case, answer))
         return answer
 
     async def on_release(self, ended: LeaseEnd) -> Released:

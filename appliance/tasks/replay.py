@@ -6,11 +6,12 @@ machine, a gap in the log, or a log of another version. Recorded logs thereby be
 
 `check` makes the decisions of a log again and compares. These deciders leave what they rest on in the log: the task
 state machine (each transition; the records show what came of it), the retry policy (on a failed attempt), the choice of
-a gateway (`gw/*/decided/placement`), the pool's selection and eviction (`gw/*/decided/selection`, `eviction`), and the
-rounds of federated learning (`gw/*/decided/round`, by `learn.decisions`). The first difference is shown with both
-sides. What the log does not have cannot be checked, and is counted instead: a gateway that is killed takes its last
-transitions with it, and a recorder may be started in the middle of a task. From the next record on, such a task is
-followed again.
+a gateway (`gw/*/decided/placement`), the pool's selection and eviction (`gw/*/decided/selection`, `eviction`), the
+floor's (`way`: which way a robot asked for or what it waited for; `grant`: what a grantor answered, and that it granted
+no ground to two robots), and the rounds of federated learning (`gw/*/decided/round`, by `learn.decisions`). The first
+difference is shown with both sides. What the log does not have cannot be checked, and is counted instead: a gateway
+that is killed takes its last transitions with it, and a recorder may be started in the middle of a task. From the next
+record on, such a task is followed again.
 """
 
 from collections import Counter
@@ -23,8 +24,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance.errors import RecordError
+from appliance.floor.decisions import WayCase, way_again
 from appliance.model import Failure, SubtaskRecord, TaskRecord, keyspace
 from appliance.model.transitions import TAKES_OVER, fingerprint
+from appliance.plane.leases import GrantCase, grant_again
 from appliance.pool.decisions import EvictionCase, SelectionCase, evict_again, select_again
 from appliance.record.models import LoggedMessage
 from appliance.record.reader import read
@@ -199,7 +202,7 @@ class Divergence(Struct, frozen=True, kw_only=True):
     """A decision that comes out differently now."""
 
     decider: str
-    """`machine`, `retry`, `placement`, `selection`, `eviction` or `round`."""
+    """`machine`, `retry`, `placement`, `selection`, `eviction`, `way`, `grant` or `round`."""
     log: str
     at_ns: int
     what: str
@@ -253,6 +256,8 @@ TRACED = {
         SelectionCase, select_again, lambda case: f"container for {case.need.image} by {case.gateway}"
     ),
     "eviction": Traced(EvictionCase, evict_again, lambda case: f"room for a run on {case.gateway}"),
+    "way": Traced(WayCase, way_again, lambda case: f"way of {case.trip.robot} for {case.trip.command}"),
+    "grant": Traced(GrantCase, grant_again, lambda case: f"ground for {case.asked.holder} by {case.gateway}"),
 }  # fmt: skip
 
 

@@ -25,6 +25,7 @@ from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import remove_fleet
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
+from appliance.tasks.replay import check
 from appliance.tasks.settings import MigrationConfig, TasksConfig
 from tests.integration.tasks.test_partition import LEASE_MS, process, until_seen
 
@@ -75,7 +76,10 @@ async def notes(client: FleetClient, task: str) -> str:
 
 
 async def test_three_rovers_and_one_dock(fleet: FleetState) -> None:
-    """One gets the dock, the others say for whom they wait, and go one by one when it is left."""
+    """One gets the dock, the others say for whom they wait, and go one by one when it is left.
+
+    The log gives the same ways, waits and grants again.
+    """
     async with FleetClient(fleet.endpoint, operator="ann") as client:
         seen = Distances(client)
         names = ("rover_1", "rover_2", "rover_3")
@@ -99,6 +103,9 @@ async def test_three_rovers_and_one_dock(fleet: FleetState) -> None:
             assert await until_ended(client, f"away-{first}") == {f"away-{first}": TaskState.SUCCEEDED}
         assert seen.least >= 2 * RADIUS_M
         seen.close()
+    report = check(sorted(Path(fleet.record_dir).glob("*.mcap")))
+    assert report.same, report.divergences
+    assert min(report.checked["way"], report.checked["grant"]) > len(names)
 
 
 async def test_a_cancelled_task_gives_its_place_up(fleet: FleetState) -> None:

@@ -6,11 +6,13 @@ from collections.abc import AsyncIterator, Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from appliance.errors import RobotError
 from appliance.floor import keeper as shell
+from appliance.floor.decisions import WayCase, way_again
 from appliance.floor.keeper import FloorKeeper
 from appliance.floor.settings import FloorConfig
 from appliance.model import Failure, Place, Pose, RobotCommand, RobotInfo, RobotReply, Site
@@ -30,13 +32,18 @@ class Fake:
         self.gateway = "gw-1"
         self.registry = SimpleNamespace(robots=dict[str, RobotInfo]())
         self.session = SimpleNamespace(
-            keys=self._keys, subscribe=self._subscribe, subscribe_typed=self._subscribe, publish=self._publish
+            keys=self._keys,
+            subscribe=self._subscribe,
+            subscribe_typed=self._subscribe,
+            publish=self._publish,
+            put=self._put,
         )
         self.leases = self
         self.grantor = Grantor(fence=0, now=time.monotonic())
         self.fence = 0
         self.sent: list[RobotCommand] = []
         self.told: list[FloorState] = []
+        self.cases: list[bytes] = []
         self.notes: list[str] = []
         self.held_up = asyncio.Event()
         self.held_up.set()
@@ -47,6 +54,9 @@ class Fake:
 
     def _subscribe(self, *_: Any) -> Any:
         return SimpleNamespace(close=lambda: None)
+
+    def _put(self, _key: str, case: bytes) -> None:
+        self.cases.append(case)
 
     def _publish(self, _topic: Any, state: FloorState, _robot: str) -> None:
         self.told.append(state)
@@ -65,6 +75,9 @@ class Fake:
             return Claim(holder=answer.holder, part=answer.part, ended=answer.left_s <= 0.0)
         until = time.clock_gettime(time.CLOCK_BOOTTIME) + ttl_s
         return Claim(lease=Lease(key=key, holder=holder, fence=self.fence, until=until))
+
+    def tell(self, _told: Any) -> None:
+        """As `Leases.tell`."""
 
     def put(self, robot: str, x: float, y: float = 0.0, **fields: Any) -> None:
         """A robot says where it is."""
@@ -164,6 +177,23 @@ async def test_it_waits_with_the_reason_and_fails_with_it(floor: FloorKeeper, fl
     assert fleet.sent == []
     assert "floor.wait_s" in failed.value.remedy
     assert fleet.notes[0] == "waits for b to leave dock 1"
+
+
+async def test_decisions_are_put_for_the_log(floor: FloorKeeper, fleet: Fake) -> None:
+    """One for what it waits for, however often it asks, and one when it goes; each can be made again by itself."""
+    fleet.put("b", 10.2)
+    going = drive(floor, fleet, goto(10.0))
+    await until(lambda: len(fleet.notes) > 0)
+    await asyncio.sleep(0.1)
+    fleet.put("b", 10.2, 8.0)
+    await going
+    cases = [msgspec.json.decode(each, type=WayCase) for each in fleet.cases]
+    assert [each.why for each in cases].count("waits for b to leave dock 1") == 1
+    assert cases[-1].why == ""
+    for case in cases:
+        again = way_again(case)
+        assert again is not None
+        assert again == {name: getattr(case, name) for name in again}
 
 
 async def test_it_waits_for_a_lost_robot_with_the_remedy(floor: FloorKeeper, fleet: Fake) -> None:

@@ -3,11 +3,24 @@
 import contextlib
 import random
 
+import msgspec
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from appliance.errors import PayloadError, RefusedError
 from appliance.model.plane_api import LONGEST_S, Granted, LeaseAsk, LeaseEnd
-from appliance.plane.leases import Grantor, granted, highest, holder_of
+from appliance.plane.leases import (
+    GrantCase,
+    Grantor,
+    answered,
+    case_of,
+    grant_again,
+    granted,
+    highest,
+    holder_of,
+)
 
 KEY = "reservation/aisle-3"
 GRANTORS = 3
@@ -285,3 +298,39 @@ def test_no_part_has_two_holders(seed: int) -> None:
             held[name], fences[name] = (frozenset(parts), now + asked.ttl_s), fence
             for other, (theirs, until) in held.items():
                 assert other == name or until <= now or theirs.isdisjoint(parts)
+
+
+Asks = list[tuple[str, int, int, bool, float]]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(ASKERS), st.integers(0, 6), st.integers(1, 4), st.booleans(), st.floats(0.0, 8.0)),
+        max_size=12,
+    )
+)
+def test_an_answer_on_parts_is_made_again_from_its_case(asks: Asks) -> None:
+    """Whatever was granted before: the same answer, and no part is granted twice at a time."""
+    grantor, now = Grantor(fence=0, now=0.0), 0.0
+    for fence, (name, first, count, cleared, passed) in enumerate(asks, start=1):
+        now += passed
+        parts = tuple(f"p{number}" for number in range(first, first + count))
+        asked = replace(ask(name, fence), parts=parts, cleared=ASKERS if cleared else ())
+        case = case_of(grantor, "gw-1", asked, now)
+        told = answered(case, grantor.grant(asked, now))
+        read = msgspec.json.decode(msgspec.json.encode(told), type=GrantCase)
+        again = grant_again(read)
+        assert again == {field: getattr(read, field) for field in again}
+        assert not read.twice
+
+
+def test_ground_that_was_granted_twice_is_a_difference() -> None:
+    """A grantor that forgets to look at others: its own case tells on it."""
+    grantor = Grantor(fence=0, now=0.0)
+    grantor.grant(replace(ask("a", 1), parts=("p1", "p2")), 0.0)
+    asked = replace(ask("b", 2), parts=("p2", "p3"))
+    told = answered(case_of(grantor, "gw-1", asked, 1.0), Granted(granted=True, fence=2))
+    assert told.twice == "a"
+    again = grant_again(told)
+    assert (again["granted"], again["holder"], again["part"], again["twice"]) == (False, "a", "p2", "")
