@@ -54,8 +54,7 @@ class Left(Struct, frozen=True, kw_only=True):
 
 def robots_of(record: TaskRecord) -> tuple[str, ...]:
     """Return the robots that have begun something for a task, in the order of its plan."""
-    begun = [each for each in record.subtasks if each.attempts]
-    return tuple(dict.fromkeys(robot for each in begun if (robot := each.bound_robot or each.subtask.robot)))
+    return tuple(dict.fromkeys(robot for each in record.subtasks if each.attempts for robot in each.robots))
 
 
 def unfinished(record: TaskRecord) -> bool:

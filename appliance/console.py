@@ -369,7 +369,7 @@ def task_table(record: TaskRecord) -> Group:
         table.add_row(
             each.subtask.id,
             each.subtask.skill,
-            each.bound_robot or each.subtask.robot or "–",
+            ", ".join(each.robots) or "–",
             Text(str(each.state), style=_STYLES[each.state]),
             each.gateway or "–",
             str(each.phase or "–"),

@@ -437,8 +437,7 @@ async def _may_be_checked(client: FleetClient, robot: str) -> None:
         )
     for task in (await client.tasks(200)).tasks:
         if task.state is TaskState.RUNNING and any(
-            each.state is SubtaskState.RUNNING and robot in (each.bound_robot, each.subtask.robot)
-            for each in task.subtasks
+            each.state is SubtaskState.RUNNING and robot in each.robots for each in task.subtasks
         ):
             raise ConflictError(f"{robot} is busy with task {task.id}", remedy="wait for its end, or cancel it")
 

@@ -1,7 +1,7 @@
 """Plans: graphs of subtasks for one instruction, and where they came from."""
 
 import hashlib
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 from msgspec import Struct, field
@@ -31,6 +31,15 @@ class Subtask(Struct, frozen=True, kw_only=True, omit_defaults=True):
     robot: str | None = None
     params: dict[str, Any] = field(default_factory=dict[str, Any])
     after: tuple[str, ...] = ()
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """All robots that do it, `robot` first: more than one where its skill is joint (its parameter `robots`)."""
+        if self.robot is None:
+            return ()
+        listed: object = self.params.get("robots")
+        more = cast("list[object]", listed) if isinstance(listed, list | tuple) else ()
+        return tuple(dict.fromkeys((self.robot, *(each for each in more if isinstance(each, str)))))
 
 
 class TierAttempt(Struct, frozen=True, kw_only=True, omit_defaults=True):

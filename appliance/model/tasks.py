@@ -197,6 +197,8 @@ class RunRequest(Struct, frozen=True, kw_only=True, omit_defaults=True):
     skill: str
     need: Need
     robot: str | None = None
+    others: tuple[str, ...] = ()
+    """The further robots of a joint skill."""
     params: dict[str, Any] = field(default_factory=dict[str, Any])
     inputs: dict[str, dict[str, Any]] = field(default_factory=dict[str, dict[str, Any]])
     coordinator: str = ""
@@ -321,6 +323,8 @@ class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     subtask: Subtask
     state: SubtaskState = SubtaskState.WAITING
     bound_robot: str | None = None
+    others: tuple[str, ...] = ()
+    """The further robots of a joint skill, bound together with `bound_robot`, in the order of the plan."""
     gateway: str = ""
     container: str = ""
     phase: Phase | None = None
@@ -344,6 +348,19 @@ class SubtaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Attempts up to this number may have been made by a coordinator whose version lost; the next is above it."""
     result: dict[str, Any] | None = None
     failure: Failure | None = None
+
+    @property
+    def bound(self) -> dict[str, str]:
+        """The robots that it is bound to, by their names in the plan; empty before it is dispatched."""
+        return (
+            dict(zip(self.subtask.robots, (self.bound_robot, *self.others), strict=False)) if self.bound_robot else {}
+        )
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """All its robots: those it is bound to, and by their names in the plan those it is not yet."""
+        bound = self.bound
+        return tuple(bound.get(each, each) for each in self.subtask.robots)
 
     @property
     def attempt(self) -> int:

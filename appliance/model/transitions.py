@@ -94,6 +94,8 @@ class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
     subtask: str = ""
     attempt: int = 0
     robot: str | None = None
+    others: tuple[str, ...] = ()
+    """On `dispatched`: the further robots of a joint skill."""
     gateway: str = ""
     container: str = ""
     phase: Phase | None = None
@@ -146,7 +148,7 @@ def fingerprint(record: TaskRecord) -> str:
     """Return 16 hexadecimal digits that tell a version of a task from others with as many transitions."""
     parts = [record.id, str(record.sequence), record.coordinator, record.state, str(record.revised)]
     for each in record.subtasks:
-        parts += [each.subtask.id, each.state, str(each.attempt), each.gateway, each.bound_robot or ""]
+        parts += [each.subtask.id, each.state, str(each.attempt), each.gateway, each.bound_robot or "", *each.others]
     return hashlib.blake2b("\0".join(parts).encode(), digest_size=8).hexdigest()
 
 

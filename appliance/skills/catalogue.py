@@ -398,6 +398,8 @@ def _check_facts(manifest: SkillManifest, skills: dict[str, SkillManifest], orig
     robots = manifest.params.get("robots")
     if manifest.joint and (robots is None or robots.type != "array" or not robots.required):
         raise _wrong(file, "joint", "needed with it: a required parameter robots of type array")
+    if robots is not None and manifest.runs == "robot" and not manifest.joint:
+        raise _wrong(file, "joint", "needed with a parameter robots: its robots are bound and stopped together")
     for phrase in manifest.phrases:
         if phrase != " ".join(phrase.lower().split()):
             raise _wrong(file, "phrases", f"{phrase!r}: lower case, single spaces")

@@ -404,7 +404,7 @@ class Decider:
     def _dispatch(self, target: SubtaskRecord, now: float) -> None:
         context, subtask = self._context, target.subtask
         try:
-            request = self._request(target, None)
+            request = self._request(target, ())
         except NotFoundError as error:
             # Planned on a gateway that knows more skills than this one, or before this one forgot it.
             failure = Failure(code=error.code, message=error.message, remedy=error.remedy)
@@ -417,15 +417,16 @@ class Decider:
                 replan=True,
             )
             return
-        robot = None
+        robots: tuple[str, ...] = ()
         if subtask.robot is not None:
-            robot, reason = context.scheduler.bind(self.record, target)
-            if robot is None:
+            robots, reason = context.scheduler.bind(self.record, target)
+            if not robots:
                 self._startup_begins(target)
                 reason = self._robot_missing(target, reason, now)
                 if reason:
                     self._wait(target, reason, now)
                 return
+        robot, others = next(iter(robots), None), robots[1:]
         placement = context.scheduler.place(self.record, target, robot)
         if not placement.order:
             self._wait(target, f"waits for a gateway: {placement.why}", now)
@@ -441,6 +442,7 @@ class Decider:
             attempt=request.attempt,
             gateway=turn.gateway,
             robot=robot,
+            others=others,
             placed=clean(placement.why, MAX_NOTE),
             **self._figures(turn.gateway),
         )
@@ -448,18 +450,18 @@ class Decider:
         self._out.append(
             Dispatch(
                 gateway=turn.gateway,
-                request=replace(request, robot=robot),
+                request=replace(request, robot=robot, others=others),
                 case=context.scheduler.case(self.record, target, placement),
             )
         )
 
-    def _request(self, target: SubtaskRecord, robot: str | None) -> RunRequest:
+    def _request(self, target: SubtaskRecord, robots: tuple[str, ...]) -> RunRequest:
         """The order for a subtask's next attempt; NotFoundError when its skill is not known here."""
         request = request_for(
             self.record,
             target,
             self._context.manifest(target.subtask.skill),
-            robot=robot,
+            robots=robots,
             coordinator=self._context.plane.gateway,
             elapsed_s=self._draft.elapsed_s,
         )
@@ -513,7 +515,7 @@ class Decider:
     ) -> bool:
         """Leave a run for its next attempt on another gateway; False when it is not under way any more."""
         name = target.subtask.id
-        request = self._request(target, target.bound_robot)
+        request = self._request(target, target.robots)
         if not self._draft.offer(
             TransitionKind.MOVED,
             subtask=name,
@@ -1030,8 +1032,10 @@ class Decider:
                 self._draft.offer(TransitionKind.RESUMED, pause=pause)
                 self._go_on()
         for target in machine.active(self.record):
-            if target.bound_robot and (why := commands.hindrance(target.bound_robot)):
-                self._hold(target, f"waits for {target.bound_robot}: {why}")
+            for robot in target.bound.values():
+                if why := commands.hindrance(robot):
+                    self._hold(target, f"waits for {robot}: {why}")
+                    break
 
     def _expire(self) -> None:
         """End a task whose plan nobody has approved in time."""

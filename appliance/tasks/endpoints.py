@@ -192,9 +192,9 @@ def _waits(
     if record.paused:
         return Waits(reason=record.paused)
     place = scheduler.line.place_of((record.id, name), time.monotonic())
-    robot, reason = scheduler.bind(record, target) if target.subtask.robot else (None, "")
+    robots, reason = scheduler.bind(record, target) if target.subtask.robot else ((), "")
     try:
-        placement = scheduler.place(record, target, robot)
+        placement = scheduler.place(record, target, next(iter(robots), None))
     except NotFoundError as error:
         return Waits(reason=error.message)
     candidates = [CandidateWhy(gateway=each, score=placement.scores.get(each)) for each in placement.order]

@@ -42,8 +42,7 @@ def matches(record: TaskRecord, ask: TasksAsk) -> bool:
 
 def robots_of(record: TaskRecord) -> tuple[str, ...]:
     """Return the robots of a task's subtasks, each once, in the order of the plan; none where it has no plan."""
-    named = (each.bound_robot or each.subtask.robot or "" for each in record.subtasks)
-    return tuple(dict.fromkeys(name for name in named if name))
+    return tuple(dict.fromkeys(robot for each in record.subtasks for robot in each.robots))
 
 
 def _text(record: TaskRecord) -> str:

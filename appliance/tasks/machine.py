@@ -529,6 +529,7 @@ def _dispatched(record: TaskRecord, event: Transition) -> TaskRecord:
             target,
             state=SubtaskState.DISPATCHED,
             bound_robot=event.robot,
+            others=event.others,
             gateway=event.gateway,
             container="",
             phase=None,

@@ -1,5 +1,6 @@
 """Run orders: what a coordinator asks of the gateway that a subtask is sent to, from the record and the manifest."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from appliance.model import Need, RunRequest, SubtaskRecord, TaskRecord
@@ -29,11 +30,11 @@ def request_for(
     target: SubtaskRecord,
     manifest: SkillManifest,
     *,
-    robot: str | None,
+    robots: Sequence[str],
     coordinator: str,
     elapsed_s: float = 0.0,
 ) -> RunRequest:
-    """Return the order for the next attempt at a subtask; `elapsed_s`: since its task was accepted."""
+    """Return the order for the next attempt at a subtask by `robots`; `elapsed_s`: since its task was accepted."""
     subtask = target.subtask
     return RunRequest(
         task=record.id,
@@ -41,7 +42,8 @@ def request_for(
         attempt=target.next_attempt,
         skill=subtask.skill,
         need=need_of(manifest),
-        robot=robot,
+        robot=robots[0] if robots else None,
+        others=tuple(robots[1:]),
         params=subtask.params,
         inputs=_inputs(record, target),
         coordinator=coordinator,

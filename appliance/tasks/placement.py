@@ -48,6 +48,7 @@ from typing import Any, cast
 from msgspec import Struct
 from msgspec.structs import replace
 
+from appliance.llm.checks.schema import assign
 from appliance.model import (
     ContainerInfo,
     ContainerState,
@@ -463,7 +464,31 @@ def waits_for_lost(name: str, robot: RobotInfo | None, lost_ns: int | None) -> s
     return f"waits for robot {name}, lost since {since:%H:%M:%S} UTC{holds}"
 
 
-def bind(
+def bind(labels: Sequence[str], choose: Callable[[str], tuple[Sequence[str], str]]) -> tuple[tuple[str, ...], str]:
+    """Choose the robots of a subtask, all different: all of them or none.
+
+    Args:
+        labels: the plan's robots, one unless its skill is joint.
+        choose: the robots that one may be, best first, or none and the reason for the wait: `candidates`.
+
+    Returns:
+        The robots in the order of the labels and "", or none and the reason for the wait.
+    """
+    fits: dict[str, Sequence[str]] = {}
+    for label in labels:
+        fits[label], reason = choose(label)
+        if not fits[label]:
+            return (), reason
+    taken: dict[str, str] = {}
+    for label in labels:
+        if not assign(label, fits, taken):
+            able = sorted({robot for robots in fits.values() for robot in robots})
+            return (), f"waits for {len(labels)} different robots: there is {', '.join(able)}"
+    robots = {label: robot for robot, label in taken.items()}
+    return tuple(robots[label] for label in labels), ""
+
+
+def candidates(
     label: str,
     records: Sequence[SubtaskRecord],
     *,
@@ -474,8 +499,8 @@ def bind(
     hindrance: Callable[[str], str] = lambda _: "",
     shuns: Callable[[SubtaskRecord, str], str] = lambda _subtask, _robot: "",
     lost_ns: Mapping[str, int] | None = None,
-) -> tuple[str | None, str]:
-    """Choose the robot behind `any`, `any1`, ... or confirm a named one.
+) -> tuple[list[str], str]:
+    """Return the robots that `any`, `any1`, ... may be, best first; for a named or bound one that one alone.
 
     Args:
         label: the plan's robot.
@@ -489,28 +514,28 @@ def bind(
         shuns: why a robot should not be given a subtask while another can do it, by experience; "" if nothing is.
 
     Returns:
-        The robot and "", or None and the reason for the wait.
+        The robots and "", or none and the reason for the wait.
     """
-    mine = [each for each in records if each.subtask.robot == label]
+    mine = [each for each in records if label in each.subtask.robots]
     # What is not done yet counts first: another robot may have taken over from the one that did the rest.
     first = sorted(mine, key=lambda each: each.state is SubtaskState.SUCCEEDED)
-    bound = next((each.bound_robot for each in first if each.bound_robot), None)
+    bound = next((each.bound[label] for each in first if label in each.bound), None)
     if bound is None and not _ANY.fullmatch(label):
         bound = label
     if bound is not None:
         robot = robots.get(bound)
         if robot is None or not robot.online:
-            return None, waits_for_lost(bound, robot, (lost_ns or {}).get(bound))
+            return [], waits_for_lost(bound, robot, (lost_ns or {}).get(bound))
         for each in mine:
             if not each.state.final:
                 asked = (uses.get(each.subtask.id, ()), verbs.get(each.subtask.id, ()))
                 if reason := lacks(robot, *asked):
-                    return None, f"waits for {bound}: {reason}"
+                    return [], f"waits for {bound}: {reason}"
         if reason := hindrance(bound):
-            return None, f"waits for {bound}: {reason}"
-        return bound, ""
-    taken = {each.bound_robot for each in records if each.bound_robot}
-    named = {each.subtask.robot for each in records if each.subtask.robot}
+            return [], f"waits for {bound}: {reason}"
+        return [bound], ""
+    taken = {robot for each in records for robot in each.bound.values()}
+    named = {robot for each in records for robot in each.subtask.robots}
     able = [
         robot
         for robot in robots.values()
@@ -520,17 +545,15 @@ def bind(
     ]
     if not able:
         wanted = sorted({use for each in mine for use in uses.get(each.subtask.id, ())})
-        return None, f"waits for a robot with {', '.join(wanted) or 'the needed skills'}"
+        return [], f"waits for a robot with {', '.join(wanted) or 'the needed skills'}"
     hindered = {each.id: reason for each in able if (reason := hindrance(each.id))}
     if len(hindered) == len(able):
-        return None, "waits for a robot: " + "; ".join(
-            f"{name} is {reason}" for name, reason in sorted(hindered.items())
-        )
+        return [], "waits for a robot: " + "; ".join(f"{name} is {reason}" for name, reason in sorted(hindered.items()))
     able = [each for each in able if each.id not in hindered]
     shunned = {robot.id: any(shuns(each, robot.id) for each in mine if not each.state.final) for robot in able}
     # One that is busy becomes free; one that keeps failing goes on failing.
     able.sort(key=lambda robot: (robot.id in taken | named, shunned[robot.id], robot.id in busy, robot.id))
-    return able[0].id, ""
+    return [each.id for each in able], ""
 
 
 Key = tuple[str, str]

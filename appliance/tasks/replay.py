@@ -179,6 +179,7 @@ def _compare_subtask(logged: SubtaskRecord, replayed: SubtaskRecord) -> list[str
             ("attempt", logged.attempt, replayed.attempt),
             ("gateway", logged.gateway, replayed.gateway),
             ("robot", logged.bound_robot, replayed.bound_robot),
+            ("further robots", logged.others, replayed.others),
         )
         if a != b
     ]

@@ -8,6 +8,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import partial
 
 import structlog
 
@@ -29,6 +30,7 @@ from appliance.tasks.placement import (
     Want,
     Weights,
     bind,
+    candidates,
     form,
     holds,
     image_holders,
@@ -105,17 +107,17 @@ class Scheduler:
 
     # --- robots -----------------------------------------------------------------------------------------------
 
-    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
-        """Choose the robot of a subtask, or None with the reason for the wait."""
+    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[tuple[str, ...], str]:
+        """Choose the robots of a subtask, its own first; none of them with the reason for the wait."""
         if why := self._closed(target.subtask):
-            return None, f"waits: {why}"
+            return (), f"waits: {why}"
         skills = self._catalogue.skills
         manifests = {
             each.subtask.id: skills[each.subtask.skill] for each in record.subtasks if each.subtask.skill in skills
         }
-        return bind(
-            target.subtask.robot or "",
-            record.subtasks,
+        choose = partial(
+            candidates,
+            records=record.subtasks,
             robots=self._plane.registry.robots,
             uses={key: manifest.uses for key, manifest in manifests.items()},
             verbs={key: manifest.verbs for key, manifest in manifests.items()},
@@ -124,11 +126,12 @@ class Scheduler:
             shuns=lambda each, robot: self._shuns(each.subtask.skill, robot),
             lost_ns=self._plane.registry.lost_ns,
         )
+        return bind(target.subtask.robots, choose)
 
     def busy_robots(self) -> frozenset[str]:
         """Return the robots with a run in progress, as far as this gateway coordinates them."""
         return frozenset(
-            each.bound_robot for record in self._records() for each in machine.active(record) if each.bound_robot
+            robot for record in self._records() for each in machine.active(record) for robot in each.bound.values()
         )
 
     # --- groups -----------------------------------------------------------------------------------------------
@@ -302,8 +305,8 @@ class Scheduler:
 
     def likely_place(self, record: TaskRecord, target: SubtaskRecord) -> str:
         """The gateway that a subtask would be sent to now, or ""."""
-        robot = self.bind(record, target)[0] if target.subtask.robot else None
-        return next(iter(self.place(record, target, robot).order), "")
+        robots = self.bind(record, target)[0] if target.subtask.robot else ()
+        return next(iter(self.place(record, target, next(iter(robots), None)).order), "")
 
     # --- turns ------------------------------------------------------------------------------------------------
 

@@ -175,14 +175,10 @@ def may_retry(record: TaskRecord, ask: RetryAsk) -> bool:
 
 def needed_robots(record: TaskRecord) -> tuple[str, ...]:
     """The robots that a task still needs, by name, or by label (`any1`) where none is chosen yet."""
-    names = {
-        each.bound_robot or each.subtask.robot
-        for each in record.subtasks
-        if not each.state.final and (each.bound_robot or each.subtask.robot)
-    }
+    names = {robot for each in record.subtasks if not each.state.final for robot in each.robots}
     if record.state is TaskState.PROPOSED and record.proposal is not None:
-        names |= {each.robot for each in record.proposal.plan.subtasks if each.robot}
-    return tuple(sorted(name for name in names if name))
+        names |= {robot for each in record.proposal.plan.subtasks for robot in each.robots}
+    return tuple(sorted(names))
 
 
 def revived(record: TaskRecord, ask: RetryAsk, *, elapsed_s: float) -> dict[str, Any] | None:

@@ -123,6 +123,8 @@ class SubtaskView(Struct, frozen=True, kw_only=True):
     id: str
     skill: str
     robot: str | None
+    others: tuple[str, ...]
+    """The further robots of a joint skill."""
     params: dict[str, Any]
     after: tuple[str, ...]
     state: str
@@ -238,6 +240,7 @@ def _subtask_view(record: SubtaskRecord) -> SubtaskView:
         id=subtask.id,
         skill=subtask.skill,
         robot=record.bound_robot or subtask.robot,
+        others=record.robots[1:],
         params=subtask.params,
         after=subtask.after,
         state=str(record.state),

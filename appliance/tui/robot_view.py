@@ -95,11 +95,10 @@ def missions(record: TaskRecord) -> dict[str, str]:
         return {}
     found: dict[str, str] = {}
     for each in record.subtasks:
-        robot = each.bound_robot or each.subtask.robot
-        if robot and each.state in _BUSY:
+        if each.state in _BUSY:
             share = f" {min(1.0, max(0.0, each.progress)):.0%}" if each.progress else ""
             waits = f" {each.note}" if each.note.startswith("waits for ") else ""
-            found[robot] = f"{record.id}/{each.subtask.id} {each.subtask.skill}{share}{waits}"
+            found |= dict.fromkeys(each.robots, f"{record.id}/{each.subtask.id} {each.subtask.skill}{share}{waits}")
     return found
 
 

@@ -193,7 +193,7 @@ def subtask_lines(record: SubtaskRecord, depth: int, width: int = 0) -> Text:
 
 
 def _robot(record: SubtaskRecord) -> str:
-    return record.bound_robot or record.subtask.robot or ""
+    return ", ".join(record.robots)
 
 
 def _facts(record: SubtaskRecord) -> Sequence[str]:

@@ -8,7 +8,7 @@ none recurses.
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from appliance.llm.checks.places import place_problems, shown
@@ -243,13 +243,19 @@ def _unnamed(plan: Plan, catalogue: Catalogue, roster: dict[str, RobotInfo]) -> 
             return
     taken: dict[str, str] = {}
     for name in fits:
-        if name != "any" and not _assign(name, fits, taken):
+        if name != "any" and not assign(name, fits, taken):
             yield f"the plan needs {len(fits)} different robots that can do this: the fleet has {len(roster)}"
             return
 
 
-def _assign(name: str, fits: dict[str, list[str]], taken: dict[str, str]) -> bool:
-    """Give `name` a robot, moving earlier ones along a shortest augmenting path."""
+def assign(name: str, fits: Mapping[str, Sequence[str]], taken: dict[str, str]) -> bool:
+    """Give `name` a robot that fits it, moving earlier ones along a shortest augmenting path.
+
+    Args:
+        name: who needs one.
+        fits: name -> the robots that it can have, best first.
+        taken: robot -> the name that has it; changed where True is returned.
+    """
     came: dict[str, str] = {}
     queue = [name]
     for current in queue:

@@ -194,7 +194,7 @@ class Moving:
                 remedy="wait until it ends; its manifest says that it must not migrate (`migratable`)",
             )
         request = request_for(
-            coordinator.record, target, manifest, robot=target.bound_robot, coordinator=self._plane.gateway
+            coordinator.record, target, manifest, robots=target.robots, coordinator=self._plane.gateway
         )
         step("fetch")
         offers = Closest(lambda tried: self._weigh(ask, coordinator.record, target, request, tried), self._history)

@@ -120,9 +120,10 @@ class FakeContext:
 
     # --- placement ----------------------------------------------------------------------------------------------
 
-    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[str | None, str]:
-        """Return the robot."""
-        return self.robot
+    def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[tuple[str, ...], str]:
+        """Return the robot, and those that the plan names beside it."""
+        robot, reason = self.robot
+        return (() if robot is None else (robot, *target.subtask.robots[1:])), reason
 
     def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
         """Gateways in order, those where it failed last."""

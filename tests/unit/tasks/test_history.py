@@ -65,7 +65,7 @@ def test_page_after_page_has_each_task_once(
 def test_filters() -> None:
     """State or what people see of it, robot, submitter, time, text; all that are given hold."""
     plan = (SubtaskRecord(subtask=Subtask(id="s1", skill="goto", robot="rover_1")),
-            SubtaskRecord(subtask=Subtask(id="s2", skill="goto"), bound_robot="drone_1"))  # fmt: skip
+            SubtaskRecord(subtask=Subtask(id="s2", skill="goto", robot="any"), bound_robot="drone_1"))  # fmt: skip
     paused = task(1, state=TaskState.RUNNING, subtasks=plan, pauses=(Pause(by="ann"),), submitter="Ann")
     failed = task(2, state=TaskState.FAILED, failure=Failure(code="robot", message="Battery is EMPTY"))
     for ask, meant in (

@@ -1,11 +1,16 @@
 """Coarse scheduling: which gateway, and which robot behind `any`."""
 
+from collections.abc import Sequence
+from itertools import permutations
+from typing import Any
+
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.model import ContainerInfo, ContainerState, GatewayStatus, Need, RobotInfo, Subtask, SubtaskRecord
-from appliance.tasks.placement import bind, place
+from appliance.tasks.placement import bind as bind_all
+from appliance.tasks.placement import candidates, place
 from appliance.tasks.settings import TasksConfig
 
 NEED = Need(image="base")
@@ -106,6 +111,12 @@ DRONE = RobotInfo(id="drone_1", kind="mavlink", uses=("base",), verbs=("goto", "
 ROBOTS = {each.id: each for each in (ROVER, DRONE)}
 
 
+def bind(label: str, these: Sequence[SubtaskRecord], **how: Any) -> tuple[str | None, str]:
+    """Return the robot of a label, or None and the reason for the wait."""
+    found, reason = bind_all((label,), lambda each: candidates(each, these, **how))
+    return next(iter(found), None), reason
+
+
 def records(*subtasks: Subtask) -> tuple[SubtaskRecord, ...]:
     """Wrap subtasks."""
     return tuple(SubtaskRecord(subtask=each) for each in subtasks)
@@ -195,3 +206,50 @@ def test_a_bound_robot_that_went_offline_is_waited_for() -> None:
     for roster, held in (({"rover_1": holding}, ", while it held the red box"), ({"rover_1": away}, ""), ({}, "")):
         _, why = bind("any", records, robots=roster, uses={}, verbs={}, busy=frozenset(), lost_ns={"rover_1": at_ns})
         assert why == f"waits for robot rover_1, lost since 22:13:20 UTC{held}", "also when its row has gone"
+
+
+def joint(*robots: str, bound: tuple[str, ...] = ()) -> SubtaskRecord:
+    """Return a subtask that several robots do together."""
+    subtask = Subtask(id="s9", skill="rendezvous", robot=robots[0], params={"robots": [*robots]})
+    return SubtaskRecord(subtask=subtask, bound_robot=next(iter(bound), None), others=bound[1:])
+
+
+def test_robots_of_a_joint_subtask_are_bound_all_or_none() -> None:
+    """While one of them is away, stopped or not there, none is bound, and the reason names that one."""
+    how: dict[str, Any] = {"uses": {"s9": ("base",)}, "verbs": {"s9": ("goto",)}, "busy": frozenset()}
+    these = (joint("rover_1", "drone_1"),)
+
+    def both(robots: dict[str, RobotInfo] = ROBOTS, **more: Any) -> tuple[tuple[str, ...], str]:
+        return bind_all(these[0].subtask.robots, lambda each: candidates(each, these, robots=robots, **how, **more))
+
+    assert both() == (("rover_1", "drone_1"), "")
+    assert both(ROBOTS | {"drone_1": replace(DRONE, online=False)}) == ((), "waits for drone_1: offline")
+    assert both({"rover_1": ROVER}) == ((), "waits for drone_1: not in the roster")
+    stopped = both(hindrance=lambda robot: "stopped by ann" if robot == "drone_1" else "")
+    assert stopped == ((), "waits for drone_1: stopped by ann")
+
+
+def test_a_label_of_a_joint_subtask_is_the_same_robot_before_and_after() -> None:
+    """Also where it is not the first of its robots."""
+    before = SubtaskRecord(subtask=Subtask(id="s1", skill="goto", robot="any2"), bound_robot="rover_1")
+    how: dict[str, Any] = {"robots": ROBOTS, "uses": {}, "verbs": {}, "busy": frozenset[str]()}
+    these = (before, joint("any1", "any2"))
+    assert bind_all(("any1", "any2"), lambda each: candidates(each, these, **how)) == (("drone_1", "rover_1"), "")
+    later = SubtaskRecord(subtask=Subtask(id="s1", skill="goto", robot="any2"))
+    assert bind("any2", (joint("any1", "any2", bound=("drone_1", "rover_1")), later), **how) == ("rover_1", "")
+
+
+@given(
+    st.dictionaries(st.sampled_from(["any", "any1", "any2", "any3"]), st.lists(st.sampled_from("abcd"), unique=True))
+)
+def test_joint_robots_are_different_ones_and_found_where_there_are_any(fits: dict[str, list[str]]) -> None:
+    """Each label has a robot that may be it, none has two labels, and it waits only where that cannot be."""
+    labels = tuple(fits)
+    found, reason = bind_all(labels, lambda label: (fits[label], "waits"))
+    possible = any(
+        all(robot in fits[label] for label, robot in zip(labels, robots, strict=True))
+        for robots in permutations("abcd", len(labels))
+    )
+    assert bool(reason) is not possible
+    assert len(set(found)) == len(found) == (len(labels) if possible else 0)
+    assert all(robot in fits[label] for label, robot in zip(labels, found, strict=False))

@@ -161,5 +161,9 @@ def test_the_robots_a_task_needs_are_those_of_what_is_left() -> None:
         SubtaskRecord(subtask=Subtask(id="d", skill="work")),
     )
     assert needed_robots(record(TaskState.RUNNING, subtasks=subtasks)) == ("any2", "r2")
+    lift = Subtask(id="e", skill="lift", robot="r1", params={"robots": ["r1", "any3"]})
+    assert needed_robots(record(TaskState.RUNNING, subtasks=(SubtaskRecord(subtask=lift),))) == ("any3", "r1")
+    bound = SubtaskRecord(subtask=lift, bound_robot="r1", others=("r7",))
+    assert needed_robots(record(TaskState.RUNNING, subtasks=(bound,))) == ("r1", "r7")
     waiting = record(TaskState.PROPOSED, proposal=Proposal(plan=PLAN, waits=True))
     assert needed_robots(waiting) == ("r1",)

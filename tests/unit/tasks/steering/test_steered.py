@@ -300,6 +300,38 @@ async def test_a_soft_stop_pauses_tasks_of_the_robot_and_its_lifting_resumes_the
     assert same(fold(bench), bench.coordinator.written)
 
 
+@pytest.mark.parametrize("stopped", ["r1", "r2", "r3"])
+async def test_a_stop_of_any_robot_of_a_joint_step_ends_its_run(bench: Any, stopped: str) -> None:
+    """The order names all its robots; a stop of any one ends the run, and the next attempt is of the same robots."""
+    step = Subtask(id="s1", skill="work", robot="r1", params={"robots": ["r1", "r2", "r3"]})
+    bench.context.the_plan = bench.plan_of(step)
+    bench.context.commands = stopping = Stopping()
+    ended: list[str] = []
+
+    async def cancel(gateway: str, ask: RunAsk) -> RunStatus:
+        ended.append(ask.run_id)
+        return RunStatus(running=False)
+
+    bench.plane.rpc.on["run_cancel"] = cancel
+    await bench.start()
+    _, request = await bench.ordered()
+    assert (request.robot, request.others) == ("r1", ("r2", "r3"))
+    bench.tell(request, RunEventKind.STARTED)
+    record = await bench.until(lambda record: record.of("s1").state is SubtaskState.RUNNING)
+    assert record.of("s1").robots == ("r1", "r2", "r3")
+    stopping.active = (SoftStop(id="st-1", robots=(stopped,), by="ann"),)
+    bench.say(Wake())
+    record = await bench.until(lambda record: bool(record.pauses))
+    assert record.of("s1").state is SubtaskState.READY
+    await bench.until(lambda _: ended == ["t-1/s1/1"])
+    assert bench.context.orders.empty()
+    stopping.lift()
+    bench.say(Wake())
+    _, request = await bench.ordered()
+    assert (request.attempt, request.robot, request.others) == (2, "r1", ("r2", "r3"))
+    assert same(fold(bench), bench.coordinator.written)
+
+
 async def test_a_stop_that_is_not_known_here_keeps_a_task_paused(bench: Any) -> None:
     """A successor that has not heard of the stop must not resume: only one that is known to be lifted ends a pause."""
     bench.context.the_plan = bench.plan_of(*ON_ROBOT)
