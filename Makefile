@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .SILENT:
 .NOTPARALLEL:
-.PHONY: help setup demo test long check lint formatted types contracts house unit format lock images ray flower train docs bundle install uninstall clean ready
+.PHONY: help setup demo test security long check lint formatted types contracts house unit format lock images ray flower train docs bundle install uninstall clean ready
 
 # Taken as it is, without make expanding "$", and given on in the environment: any text may stand in it.
 override ASK := $(value ASK)
@@ -27,12 +27,16 @@ demo: setup ## Start a fleet, run instructions on it, replay its log
 test: ## Set up and run the tests: lint, types, import contracts, unit, integration and replay tests but the long ones
 	scripts/setup.sh dev --with-browser
 	$(MAKE) --no-print-directory lint formatted types contracts READY=1
-	scripts/whole_suite.sh -m 'not long' tests/unit tests/reports tests/replay tests/integration
+	scripts/whole_suite.sh -m 'not long' tests/unit tests/reports tests/replay tests/integration tests/security
+
+security: ## Set up and run the attacks: what somebody without keys, with a stolen or another's certificate tries
+	scripts/setup.sh dev
+	scripts/whole_suite.sh tests/security
 
 long: ## Set up and run the long tests
 	scripts/setup.sh dev --with-browser --with-prometheus
 	$(MAKE) --no-print-directory docs
-	scripts/whole_suite.sh -m long tests/unit tests/reports tests/replay tests/integration
+	scripts/whole_suite.sh -m long tests/unit tests/reports tests/replay tests/integration tests/security
 
 # Types and tests take longest, and neither needs the other: at the same time.
 check: ready ## The fast part: lint, types, import contracts, unit tests but the long ones, with few examples of each property

@@ -203,6 +203,8 @@ class IdentityError(SwiftbotError):
 
     code = "identity"
     exit_code = Exit.DENIED
+    sender = ""
+    """Name in the certificate of who asked, where the signature is good and only the role is not."""
 
 
 class CancelledByOperatorError(SwiftbotError):

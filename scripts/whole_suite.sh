@@ -6,8 +6,8 @@
 # is short and has the machine for itself; a test that fails in it as well fails the suite, and so does any other test
 # that failed. Properties are tried with the same examples in every run, so that what passed on one machine passes on the
 # next, and a counterexample comes again; `make check` draws new ones, and so does SWIFTBOT_SEED=$RANDOM here.
-# Tests outside tests/integration run in two processes; those in it, which mostly wait, in three, each a file at a time,
-# but for those marked `alone`, which run after them one after another. Of these the slowest are listed.
+# Tests in tests/integration and tests/security, which mostly wait, run in three processes, each a file at a time, others in
+# two, but for those marked `alone`, which run after them one after another. Of these the slowest are listed.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 marks=
@@ -21,7 +21,7 @@ suite() { run "${PYTHON:-python}" -m pytest -o "cache_dir=$memory" "--hypothesis
 seed=${SWIFTBOT_SEED:-1}
 apart=() together=()
 for path in "$@"; do
-    case $path in *integration*) apart+=("$path") ;; *) together+=("$path") ;; esac
+    case $path in *integration* | *security*) apart+=("$path") ;; *) together+=("$path") ;; esac
 done
 failed=0
 first() {

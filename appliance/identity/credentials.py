@@ -247,7 +247,11 @@ class Credentials:
             IdentityError: as of `Verifier.verify`, or it is of another role.
         """
         identity = self._verifier.verify(signature, key, payload, now=time.time(), clock_s=time.monotonic())
-        _check_role(identity, roles, f"ask {key}")
+        try:
+            _check_role(identity, roles, f"ask {key}")
+        except IdentityError as error:
+            error.sender = identity.name
+            raise
         return identity
 
     def keep(self) -> None:

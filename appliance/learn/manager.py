@@ -383,7 +383,7 @@ class LearnManager:
         if driver is None:
             return
         if not self._plane.sees(event.gateway):
-            self._plane.session.refuse("forged run event", key=event.task, reason=f"from {event.gateway[:80]!r}")
+            self._plane.session.deny("forged run event", event.task, f"from {event.gateway[:80]!r}")
             return
         driver.heard(event)
 

@@ -42,7 +42,8 @@ class Act(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The task, robot, gateway or image it was about."""
     why: str = ""
     outcome: str = "done"
-    """`done`, or the code of the error."""
+    """`done`, or the code of the error; `denied`: refused for whom it was from; `unverified`: a soft stop that was
+    carried out without a good signature."""
     problem: str = ""
     """Why it was not done."""
     gateway: str = ""

@@ -88,7 +88,7 @@ class Handing:
         except IdentityError as error:
             if held.number >= number:
                 return  # a newer one came from elsewhere meanwhile
-            self._rpc.refuse(f"bad {self._verb.name}", reason=error.message)
+            self._rpc.deny(f"bad {self._verb.name}", self._verb.name, error.message)
             raise
         log.info("another one counts", what=self._verb.name, number=held.number)
         self._on_taken()

@@ -273,8 +273,10 @@ class Membership:
             try:
                 await prove(name)
             except SwiftbotError as error:
-                self._session.refuse("token without a gateway", member=name, reason=str(error))
-                if not isinstance(error, IdentityError):
+                if isinstance(error, IdentityError):
+                    self._session.deny("token without a gateway", name, str(error))
+                else:
+                    self._session.refuse("token without a gateway", member=name, reason=str(error))
                     pause_s = min(LATE_S, pause_s)
                 await asyncio.sleep(pause_s)
                 pause_s = min(longest_s, pause_s * 2)

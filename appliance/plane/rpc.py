@@ -62,6 +62,8 @@ class Rpc:
     def __init__(self, session: Session, gateway: str | None) -> None:
         self.refuse = session.refuse
         """Counts bad input of those that are asked or ask."""
+        self.deny = session.deny
+        """The same, for whom it is from: the audit has it too."""
         self._session = session
         self._gateway = gateway
         self._verbs = None if gateway is None else session.serve_verbs(session.keys(keyspace.RPC, gateway))

@@ -81,6 +81,7 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger(__name__)
 
+REVOKED = "the certificate of that robot is revoked"
 _INBOX_TURN = 256
 """Deliveries per turn of the loop, so that a flood does not starve everything else."""
 _OUTBOX_TURN = 64
@@ -302,6 +303,8 @@ class Wire:
         """What this session has put lately."""
         self.loop = loop
         self.refused: dict[str, int] = {}
+        self.on_denied: Callable[[str, str, str, str], None] | None = None
+        """Called by `deny`, with its arguments."""
         self.closed = False
         self.inbox = Inbox(
             loop,
@@ -420,6 +423,19 @@ class Wire:
         if total <= 10 or before.bit_length() != total.bit_length():
             fields = {key: value[:300] if isinstance(value, str) else value for key, value in fields.items()}
             log.warning("refused", what=what, count=total, **fields)
+
+    def deny(self, what: str, key: str, reason: str, by: str = "") -> None:
+        """Refuse something for whom it is from: counted as bad input is, and told to the audit.
+
+        Args:
+            what: the kind.
+            key: where it came.
+            reason: why.
+            by: name of who it was, where that is proven.
+        """
+        self.refuse(what, key=key, reason=reason)
+        if self.on_denied is not None:
+            self.on_denied(what, key, reason, by)
 
     def check_role(self, roles: Roles, what: str) -> None:
         """Raise IdentityError when this process has keys of a role that is not among those."""
@@ -774,7 +790,7 @@ class Publishing:
             if not heed(key):
                 return
             if self._wire.barred(key):
-                self._wire.inbox.post(partial(self._wire.refuse, f"revoked {name}", key=key))
+                self._wire.inbox.post(partial(self._wire.deny, f"revoked {name}", key, REVOKED))
                 return
             if size > limit:
                 self._wire.inbox.post(partial(self._wire.refuse, f"oversize {name}", key=key, size=size))
@@ -983,7 +999,7 @@ class Presence:
                 inbox.post(partial(self._wire.refuse, f"wildcard {name}", key=key))
                 return
             if alive and self._wire.barred(key):
-                inbox.post(partial(self._wire.refuse, f"revoked {name}", key=key))
+                inbox.post(partial(self._wire.deny, f"revoked {name}", key, REVOKED))
                 return
             inbox.post(partial(deliver, raw, key, alive), must=True)
 
@@ -1075,23 +1091,27 @@ class Answering:
             if not served.urgent:
                 raise
             # A stop is carried out for every asker, also where a defect keeps its signature from being read.
-            self.wire.refuse(f"unverified {served.name}", key=key, reason=str(error))
+            self.wire.deny(f"unverified {served.name}", key, str(error))
             return None
 
     async def _answer(self, served: "Served", key: str, data: bytes, reply: Answer, signature: bytes) -> None:
         name = served.name
         answer: bytes | None = None
         error: SwiftbotError | None = None
+        known = False
         try:
             SENDER.set(self._sender(served, key, data, signature))
+            known = True
             answer = await served.handler(key, data)
             if len(answer) > self.wire.config.max_payload_bytes:
                 error = PayloadError(f"{key}: the answer has {len(answer):,} bytes", remedy="ask for less at once")
         except SwiftbotError as refusal:
             if isinstance(refusal, PayloadError):
                 self.wire.refuse(f"malformed {name}", key=key, reason=str(refusal))
-            elif isinstance(refusal, IdentityError):
+            elif isinstance(refusal, IdentityError) and known:
                 self.wire.refuse(f"unauthorized {name}", key=key, reason=str(refusal))
+            elif isinstance(refusal, IdentityError):
+                self.wire.deny(f"unauthorized {name}", key, str(refusal), refusal.sender)
             error = refusal
         except asyncio.CancelledError:
             error = UnreachableError("the one that was asked is stopping", remedy="ask another gateway")
@@ -1122,6 +1142,11 @@ class Answering:
     def refuse(self, what: str, key: str, reply: Answer, error: SwiftbotError) -> None:
         """Refuse a question as bad input, which is counted."""
         self.wire.refuse(what, key=key, reason=str(error))
+        reply(None, error)
+
+    def deny(self, what: str, key: str, reply: Answer, error: IdentityError) -> None:
+        """Refuse a question for whom it is from, which is counted and told to the audit."""
+        self.wire.deny(what, key, str(error), error.sender)
         reply(None, error)
 
     async def stop(self, wait_s: float) -> None:
@@ -1169,8 +1194,8 @@ class Served:
             begin = partial(answering.misrouted, self.name, self.expr, link.asker_of(query), reply, error)
             size = 0
         elif self._wire.barred(str(query.key_expr)):
-            error = IdentityError(f"{query.key_expr}: the certificate of that robot is revoked")
-            begin = partial(answering.refuse, f"revoked {self.name}", str(query.key_expr), reply, error)
+            error = IdentityError(f"{query.key_expr}: {REVOKED}")
+            begin = partial(answering.deny, f"revoked {self.name}", str(query.key_expr), reply, error)
             size = 0
         elif size > limit:
             error = PayloadError(f"{query.key_expr}: {size:,} bytes", remedy=f"at most {limit:,}")
@@ -1570,6 +1595,7 @@ class Session:
         self.refused: dict[str, int] = wire.refused
         """Counts of bad input by kind."""
         self.refuse = wire.refuse
+        self.deny = wire.deny
         self.check_role = wire.check_role
         self._wire = wire
         self._sockets = SocketWatch.shared(config.lease_ms)
@@ -1595,6 +1621,10 @@ class Session:
         self.watch_alive = presence.watch_alive
         self.hold_alive = presence.hold_alive
         self.renew_links = doors.renew
+
+    def watch_denied(self, callback: Callable[[str, str, str, str], None]) -> None:
+        """Call back with what is refused for whom it is from: kind, key, reason, and whose it was, where proven."""
+        self._wire.on_denied = callback
 
     @classmethod
     async def open(cls, config: PlaneConfig, fleet: str, gateway: str = "", *, roster: Path | None = None) -> "Session":

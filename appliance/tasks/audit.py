@@ -1,8 +1,12 @@
-"""The audit of operators' orders: who ordered what of whom, why, and what came of it, on one key and in the log."""
+"""The audit of orders: who ordered what of whom, why, and what came of it, on one key and in the log.
+
+What is refused for whom it is from (no good signature, another role, a revoked robot) is in it too. Of each kind ten at
+once are told and then one a minute, with how many came between: who sends such things all day hides no order.
+"""
 
 import time
 import uuid
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Awaitable, Callable
 from typing import TypeVar, cast
 
@@ -14,6 +18,7 @@ from appliance.model import Act, Signed, TaskRecord, TaskRequest, keyspace
 from appliance.model.keys import Keys
 from appliance.model.task_api import ActList, ActsAsk
 from appliance.plane.session import Closer, Session
+from appliance.tasks.migration.policy import Bucket
 from appliance.tasks.records import clean
 
 log = structlog.get_logger(__name__)
@@ -23,6 +28,13 @@ SUBMIT = "submit"
 KEPT = 500
 """Orders that a gateway remembers for those who ask, its own and others'; the log on disk has all."""
 MAX_PROBLEM = 1000
+DENIED, UNVERIFIED = "denied", "unverified"
+"""Outcomes: refused for whom it is from; a soft stop that was carried out without a good signature."""
+UNPROVEN = "unproven"
+"""Who it was that no certificate names."""
+DENIED_AT_ONCE = 10
+MOST_KINDS = 256
+"""Kinds and senders of what is refused that are told apart."""
 OF_GATEWAY = frozenset(
     {"drain", "undrain", "pool_warm", "pool_evict", "pool_release_quarantine", "llm_swap", "image_fetch"}
 )
@@ -44,9 +56,12 @@ class Audit:
         self._acts: deque[tuple[float, Act]] = deque(maxlen=KEPT)
         self._submissions: deque[tuple[float, Act]] = deque(maxlen=KEPT)
         """Apart, so that a script that submits all day does not push out who stopped what."""
+        self._denied: deque[tuple[float, Act]] = deque(maxlen=KEPT // 5)
+        self._sparing: OrderedDict[tuple[str, str], _Sparing] = OrderedDict()
 
     def listen(self) -> Closer:
-        """Remember what was ordered of others too: a gateway that dies takes no order along."""
+        """Note what is refused here, and remember what others noted: a gateway that dies takes no order along."""
+        self._session.watch_denied(self._on_denied)
         return self._session.subscribe_typed(keyspace.ACT, self._on_act)
 
     def _on_act(self, key: str, act: Act | None) -> None:
@@ -54,7 +69,30 @@ class Audit:
             self._keep(act)
 
     def _keep(self, act: Act) -> None:
-        (self._submissions if act.verb == SUBMIT else self._acts).append((time.monotonic(), act))
+        denied = self._denied if act.outcome in (DENIED, UNVERIFIED) else self._acts
+        (self._submissions if act.verb == SUBMIT and denied is self._acts else denied).append((time.monotonic(), act))
+
+    def _on_denied(self, what: str, key: str, reason: str, by: str) -> None:
+        sparing = self._sparing.setdefault((what, by), _Sparing())
+        self._sparing.move_to_end((what, by))
+        if len(self._sparing) > MOST_KINDS:
+            self._sparing.popitem(last=False)
+        if not sparing.bucket.take(time.monotonic()):
+            sparing.left_out += 1
+            return
+        between, sparing.left_out = sparing.left_out, 0
+        act = Act(
+            id=f"o-{uuid.uuid4().hex[:16]}",
+            verb=clean(key.rpartition("/")[2], 60),
+            by=clean(by, 120) or UNPROVEN,
+            target=clean(key.removeprefix(f"{self._keys.root}/"), 300),
+            outcome=UNVERIFIED if what.startswith(UNVERIFIED) else DENIED,
+            problem=clean(f"{what}: {reason}" + (f" ({between:,} more before)" if between else ""), MAX_PROBLEM),
+            gateway=self._gateway,
+            at_ns=time.time_ns(),
+        )
+        self._keep(act)
+        self._session.publish(keyspace.ACT, act, self._gateway)
 
     def signed(
         self, verb: str, handler: Callable[[Q], Awaitable[R]], *, when: Callable[[Q], bool] = lambda _: True
@@ -134,8 +172,16 @@ class Audit:
     async def acts(self, ask: ActsAsk) -> ActList:
         """Answer `acts`."""
         # By when they were heard of here: clocks of gateways differ.
-        newest = sorted((*self._acts, *self._submissions), key=lambda heard: heard[0], reverse=True)
+        newest = sorted((*self._acts, *self._submissions, *self._denied), key=lambda heard: heard[0], reverse=True)
         return ActList(acts=tuple(act for _, act in newest[: max(0, ask.limit)]))
+
+
+class _Sparing:
+    """How much of one kind of refusal is told."""
+
+    def __init__(self) -> None:
+        self.bucket = Bucket(1 / 60, burst=DENIED_AT_ONCE)
+        self.left_out = 0
 
 
 def target_of(ask: Signed) -> str:

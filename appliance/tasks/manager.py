@@ -713,7 +713,7 @@ class TaskManager:
         if event is None or (coordinator := self._coordinators.get(event.task)) is None:
             return
         if not key.endswith(f"/task/{event.task}/run/{event.subtask}") or not self.plane.sees(event.gateway):
-            self.plane.session.refuse("forged run event", key=key, reason=f"from {clean(event.gateway, 80)!r}")
+            self.plane.session.deny("forged run event", key, f"from {clean(event.gateway, 80)!r}")
             return
         if self._runs is None or event.gateway != self.plane.gateway:
             coordinator.put(RunReported(event))

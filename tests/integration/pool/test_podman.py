@@ -43,42 +43,6 @@ async def test_cold_then_warm(bench: Bench) -> None:
         assert begin.startup_ms > 0
 
 
-async def test_hardening(bench: Bench) -> None:
-    """Inside, nothing can be written but a bounded /tmp, there is no network, no capability and no way to any."""
-    pool = await bench.pool()
-    await bench.ready(pool)
-    result = (await bench.run(pool, "harden")).result
-    assert result is not None
-    for place in ("root", "usr", "skills", "runner"):
-        assert result[place] == "OSError: Read-only file system", place
-    assert result["tmp"] == "done"
-    assert result["fill"] == "OSError: No space left on device"
-    assert "unreachable" in result["net"]
-    assert result["interfaces"] == ["lo"]
-    assert set(result["caps"]) == {"0000000000000000"}
-    assert (result["nnp"], result["seccomp"]) == ("1", "2")
-    assert "not permitted" in result["chown"]
-    assert "ro" in result["mount"].split(",")
-
-
-@pytest.mark.skipif(os.uname().machine != "x86_64", reason="asks by numbers of x86-64's system calls")
-async def test_the_kernel_is_not_asked_for_namespaces(bench: Bench) -> None:
-    """User namespaces, mounts, ptrace, io_uring and keys are refused; threads and programs work.
-
-    With Podman's own profile most of them work, so it is the program's that refuses them.
-    """
-    pool = await bench.pool()
-    await bench.ready(pool)
-    result = (await bench.run(pool, "kernel")).result
-    refused = dict.fromkeys(("user namespace", "mount", "ptrace", "io_uring", "keyctl"), "EPERM")
-    assert result == refused | dict.fromkeys(("clone into a namespace", "clone3"), "ENOSYS") | {"program": 0}
-    open_pool = await bench.pool(gateway="g2", seccomp_profile="podman")
-    await bench.ready(open_pool)
-    result = (await bench.run(open_pool, "kernel")).result
-    assert result is not None
-    assert [result[name] for name in ("user namespace", "ptrace")] == ["done", "done"]
-
-
 async def test_runs_leave_nothing(bench: Bench) -> None:
     """Files in /tmp and /dev/shm and processes that left their group are gone before the next run."""
     pool = await bench.pool(capacity=1)

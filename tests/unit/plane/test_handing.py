@@ -1,7 +1,7 @@
 """Signed files between gateways: the newest reaches all, whatever is handed on besides and in whatever order."""
 
 from collections.abc import Awaitable, Callable
-from typing import Any, cast
+from typing import cast
 
 import pytest
 from hypothesis import given
@@ -58,7 +58,7 @@ class Wire:
             def register(self, _verb: object, handler: Callable[[SealedAsk], Awaitable[SealedTold]]) -> None:
                 wire.ends[name] = handler
 
-            def refuse(self, what: str, **_: Any) -> None:
+            def deny(self, what: str, *_: str) -> None:
                 wire.refused.append(what)
 
             async def call(self, gateway: str, _verb: object, ask: SealedAsk) -> SealedTold:

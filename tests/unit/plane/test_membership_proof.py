@@ -67,7 +67,7 @@ async def test_a_token_alone_makes_no_member(here: Here) -> None:
     assert here.it.members == {"gw-1", "gw-2"}
     assert here.it.ring.members == {"gw-1", "gw-2"}
     assert here.events == [Joined("gw-2")]
-    assert {call.args[0] for call in here.session.refuse.call_args_list} == {"token without a gateway"}
+    assert {call.args[0] for call in here.session.deny.call_args_list} == {"token without a gateway"}
 
 
 async def test_one_that_does_not_answer_at_once_joins_when_it_does(here: Here) -> None:

@@ -33,6 +33,7 @@ class FakeSession:
         self.keys = Keys("f")
         self.puts: list[tuple[str, bytes]] = []
         self.refused: dict[str, int] = {}
+        self.on_denied: Callable[[str, str, str, str], None] | None = None
         self.subscribers: list[tuple[str, Callable[[Message], None]]] = []
         self.queries: list[bytes] = []
         self.replies: list[bytes | SwiftbotError] = []
@@ -71,6 +72,16 @@ class FakeSession:
     def refuse(self, what: str, **_: object) -> None:
         """Count."""
         self.refused[what] = self.refused.get(what, 0) + 1
+
+    def deny(self, what: str, key: str, reason: str, by: str = "") -> None:
+        """Count, and tell."""
+        self.refuse(what)
+        if self.on_denied is not None:
+            self.on_denied(what, key, reason, by)
+
+    def watch_denied(self, callback: Callable[[str, str, str, str], None]) -> None:
+        """Tell of what is denied."""
+        self.on_denied = callback
 
     async def query(self, key: str, payload: bytes, *, timeout_s: float, sign: bool, urgent: bool = False) -> bytes:
         """Answer with the next prepared reply; the last one again and again. Robots are asked with a signature only."""

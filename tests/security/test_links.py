@@ -14,6 +14,8 @@ from secured import FLEET, GATEWAYS, Secured, secured, until
 
 from appliance.errors import ConfigError, IdentityError, UnreachableError
 from appliance.identity.authority import Authority
+from appliance.model import keyspace
+from appliance.model.keys import Keys
 from appliance.model.roles import Role
 from appliance.plane import link
 from appliance.plane.client import PlaneClient
@@ -64,6 +66,46 @@ async def test_without_a_certificate_there_is_no_link(
         client = await PlaneClient.open(fleet.client(Role.VIEWER), fleet=FLEET)
         assert client.members() == set(GATEWAYS)
         await client.close()
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+async def test_without_a_certificate_not_one_key_is_readable_or_writable(
+    protocol: str, tmp_path: Path, free_ports: Callable[..., list[int]]
+) -> None:
+    """By one who dials and listens as a peer: each key is put, subscribed to, asked and shown as alive."""
+    keys = Keys(FLEET)
+    async with secured(tmp_path, free_ports(2), protocol=protocol) as fleet:
+        own: set[str] = set()
+        fleet.planes["g0"].session.subscribe(keys.everything, lambda message: own.add(message.key))
+        endpoints = list(fleet.endpoints.values())
+        around = {
+            "mode": "peer",
+            "connect/endpoints": [*endpoints, *(each.replace(protocol, "tcp") for each in endpoints)],
+            "connect/exit_on_failure": False,
+            "listen/endpoints": ["tcp/127.0.0.1:0"],
+        }
+        config = plain(endpoints[0], fleet.authority.folder / "authority.crt", **around)
+        raw = await asyncio.to_thread(zenoh.open, config)
+        heard: set[str] = set()
+        subscriber = raw.declare_subscriber(
+            "**", lambda sample: heard.add(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
+        )
+        tokens = [raw.liveliness().declare_token(keys(keyspace.GATEWAY_ALIVE, "evil"))]
+        for topic in keyspace.TOPICS:
+            if topic.form not in ("token", "query"):
+                raw.put(keys(topic, *(f"evil-{field}" for field in topic.fields)), b"{}")
+        questions = [keys(keyspace.RPC, "g0", verb.name) for verb in keyspace.VERBS]
+        asked = [raw.get(each, payload=b"{}", timeout=1.0) for each in (*questions, f"{keys.root}/**", "@/**")]
+        fleet.planes["g1"].session.put(keys(keyspace.STATUS, "g1"), b"{}")
+        answers = [reply for each in asked for reply in await asyncio.to_thread(list, each)]
+        assert not [each for each in answers if each.ok is None or not str(each.ok.key_expr).startswith("@")]
+        assert heard == set()
+        assert list(raw.info.peers_zid()) == list(raw.info.routers_zid()) == []
+        await until(lambda: keys(keyspace.STATUS, "g1") in own)
+        assert not [each for each in own if "evil" in each]
+        assert {frozenset(plane.members()) for plane in fleet.planes.values()} == {frozenset(GATEWAYS)}
+        del subscriber, tokens
+        await asyncio.to_thread(raw.close)
 
 
 async def test_another_authoritys_certificate_is_none(fleet: Secured, tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from appliance.identity.authority import Authority
 from appliance.model import Lease, TaskRequest, TaskState
 from appliance.model.roles import Role
 from workshop import keyring
-from workshop.bench import security
 from workshop.local_fleet import keys_folder
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman, pytest.mark.timeout(300)]
@@ -90,15 +89,3 @@ async def _until_refused(client: FleetClient, lease: Lease) -> None:
     while True:
         await client.renew(lease)
         await asyncio.sleep(0.5)
-
-
-async def test_the_benchmark_measures_both_sides(built: None) -> None:
-    """Each kind with keys and without, as often as asked, by gateways of its own."""
-    found = await security.run(25, 2, image="base", progress=print)
-    assert {kind: [found[kind][side]["count"] for side in security.SIDES] for kind in found} == {
-        "put": [25, 25],
-        "get": [25, 25],
-        "round_trip": [25, 25],
-        "elsewhere": [2, 2],
-    }
-    assert all(each["ratio"] > 0 for each in found.values())

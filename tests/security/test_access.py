@@ -1,6 +1,7 @@
 """Each role against each key on real links: what is put, read, asked, answered and shown is what the table allows."""
 
 import asyncio
+import contextlib
 import os
 import sys
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import pytest
 import zenoh
 from secured import FLEET, NAMES, Secured, until
 
-from appliance.errors import IdentityError, UnreachableError
+from appliance.errors import IdentityError, SwiftbotError, UnreachableError
 from appliance.model import RobotCommand, keyspace
 from appliance.model.keys import Keys, Topic
 from appliance.model.plane_api import KeyAsk
@@ -214,6 +215,36 @@ async def test_a_robot_does_what_robots_do(fleet: Secured) -> None:
     token.close()
     await until(lambda: len(alive) == 2)
     await session.close()
+
+
+async def test_a_robot_asks_no_other_robot(fleet: Secured) -> None:
+    """Neither to do something, nor for what it has said, nor in its place; the one that is asked hears nothing."""
+    other = await Session.open(fleet.client(Role.ROBOT, "r2"), FLEET)
+    heard: list[str] = []
+
+    async def command(key: str, payload: bytes) -> bytes:
+        heard.append(key)
+        return payload
+
+    for name in ("r1", "r2"):
+        fleet.planes["g0"].session.serve(KEYS(keyspace.INTAKE, name), command)
+    other.serve(KEYS(keyspace.COMMAND, "r2"), command)
+    while not heard:
+        with contextlib.suppress(SwiftbotError):
+            await fleet.planes["g0"].session.query(KEYS(keyspace.COMMAND, "r2"), b"go", timeout_s=1.0, sign=True)
+    raw = await fleet.raw(Role.ROBOT, "r1")
+
+    def answered(key: str) -> bool:
+        return bool(list(raw.get(key, payload=b"{}", timeout=2.0)))
+
+    assert await asyncio.to_thread(answered, KEYS(keyspace.INTAKE, "r1"))
+    heard.clear()
+    asked = [KEYS(keyspace.COMMAND, "r2"), KEYS(keyspace.INTAKE, "r2"), f"{KEYS.root}/robot/**", f"{KEYS.root}/**"]
+    for each in asked:
+        assert not await asyncio.to_thread(answered, each), each
+    assert heard == []
+    await asyncio.to_thread(raw.close)
+    await other.close()
 
 
 async def test_a_robot_that_the_roster_lacks_is_let_into_nothing(fleet: Secured) -> None:
