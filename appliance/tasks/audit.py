@@ -18,7 +18,7 @@ from appliance.model import Act, Signed, TaskRecord, TaskRequest, keyspace
 from appliance.model.keys import Keys
 from appliance.model.task_api import ActList, ActsAsk
 from appliance.plane.session import Closer, Session
-from appliance.tasks.migration.policy import Bucket
+from appliance.tasks.bucket import Bucket
 from appliance.tasks.records import clean
 
 log = structlog.get_logger(__name__)

@@ -41,7 +41,7 @@ from appliance.pool.fair_queue import Turn, turn_of
 from appliance.pool.pool import Call
 from appliance.pool.selection import Decision
 from appliance.skills.catalogue import SkillManifest
-from appliance.tasks.migration.policy import Bucket
+from appliance.tasks.bucket import Bucket
 from appliance.tasks.orders import LEAVE_S
 from appliance.tasks.placement import bytes_by_gateway
 from appliance.tasks.settings import MigrationConfig

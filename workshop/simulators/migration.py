@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from appliance.model import GatewayStatus, Need
+from appliance.tasks.bucket import Bucket
 from appliance.tasks.migration.gateway import free_places
-from appliance.tasks.migration.policy import Bucket, Candidate, History, Load, Overload, Place, Room, closest
+from appliance.tasks.migration.policy import Candidate, History, Load, Overload, Place, Room, closest
 from appliance.tasks.settings import MigrationConfig
 
 STEP_S = 0.1

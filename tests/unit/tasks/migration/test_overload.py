@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from appliance.model import Need, RunRequest
-from appliance.tasks.migration.policy import Bucket, Candidate, Load, Overload, Room, cost_s, may_leave, remaining_s
+from appliance.tasks.bucket import Bucket
+from appliance.tasks.migration.policy import Candidate, Load, Overload, Room, cost_s, may_leave, remaining_s
 from appliance.tasks.settings import MigrationConfig
 
 CONFIG = MigrationConfig()
