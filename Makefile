@@ -104,8 +104,8 @@ docs: ## The documentation as a site in build/docs, its links checked
 train: ## What `swiftbot train` needs (PyTorch), in an environment of its own (5 GB)
 	scripts/setup.sh gateway --without-images --with-train
 
-bundle: setup ## One signed file that installs without a network (KEY=file of `swiftbot release key`, OUT=file)
-	KEY="$(KEY)" OUT="$(OUT)" scripts/bundle.sh
+bundle: setup ## One signed file that installs without a network (KEY=file of `swiftbot release key`, OUT=file, MODELS=, PARTS=)
+	KEY="$(KEY)" OUT="$(OUT)" MODELS="$(MODELS)" PARTS="$(PARTS)" scripts/bundle.sh
 
 install: ## Install as systemd services on this machine (DESTDIR=… for a package)
 	DESTDIR="$(DESTDIR)" scripts/install.sh

@@ -1,11 +1,14 @@
 #!/usr/bin/env bash
 # Makes a bundle: a release in one signed file, which `swiftbot upgrade` installs without a network (`make bundle`).
 #
-#   KEY=release.key [OUT=file] scripts/bundle.sh
+#   KEY=release.key [OUT=file] [MODELS="folder …"] [PARTS="file …"] scripts/bundle.sh
 #
 # KEY is a file that `swiftbot release key` made. In the bundle: the program and its packages as wheels (locks/gateway.txt,
-# by hash), uv, units, the page of operations, the source, and the container images that this machine has; a gateway
-# builds images that are not in it. For the architecture and Python of this machine.
+# by hash), uv, units, the page of operations, the source, the container images that this machine has (a gateway builds
+# those that are not in it), and the Debian packages that a gateway needs with all that those need, from this machine's apt
+# sources. MODELS: folders of models for the planner, beside the one in the program. PARTS: signed lists of parts
+# (`swiftbot parts sign`), one for each fleet that gets the bundle. WITHOUT_IMAGES=1 and WITHOUT_PACKAGES=1 leave these out.
+# For the architecture, Debian release and Python of this machine.
 set -euo pipefail
 umask 022
 . "$(dirname "${BASH_SOURCE[0]}")/common.sh"
@@ -47,6 +50,31 @@ cp -r "$PROJECT/systemd" "$work/files/systemd"
 chmod 0755 "$work"/files/systemd/system-generators/*
 cp "$PROJECT/docs/operations.md" "$work/files/docs/"
 cp "$PROJECT/LICENSE" "$work/files/"
+
+if [ -z "${WITHOUT_PACKAGES:-}" ]; then
+  say "Debian packages"
+  mkdir -p "$work/files/packages/partial" "$work/apt"
+  : >"$work/status" # as on a machine that has none: what others lack is not known here
+  # chrony besides: a machine whose clock nothing keeps gets it (scripts/setup.sh host).
+  apt-get -q -y -o "Dir::State::status=$work/status" -o "Dir::Cache=$work/apt" -o "Dir::Cache::archives=$work/files/packages" \
+    -o APT::Sandbox::User=root -o Debug::NoLocking=1 --no-install-recommends --download-only \
+    install "${GATEWAY_PACKAGES[@]}" chrony >"$work/log" 2>&1 || {
+    tail -n 5 "$work/log" >&2
+    die "the Debian packages" "apt-get update, and look at the machine's apt sources; WITHOUT_PACKAGES=1 leaves them out"
+  }
+  rm -rf "$work/files/packages/partial" "$work/files/packages/lock"
+  printf '%s\n' "${GATEWAY_PACKAGES[@]}" >"$work/files/packages/wanted"
+fi
+for model in ${MODELS:-}; do
+  [ -d "$model" ] || die "$model is no folder of a model" "MODELS=\"folder …\""
+  mkdir -p "$work/files/models"
+  cp -rL "$model" "$work/files/models/"
+done
+number=0
+for list in ${PARTS:-}; do
+  mkdir -p "$work/files/parts"
+  cp "$list" "$work/files/parts/$((number += 1)).json" || die "$list cannot be read" "swiftbot parts sign writes it"
+done
 
 if [ -z "${WITHOUT_IMAGES:-}" ]; then
   images=$(cd / && as_user podman images --quiet --no-trunc --filter 'reference=localhost/swiftbot/*' 2>/dev/null) || images=

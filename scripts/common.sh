@@ -7,6 +7,9 @@
 
 PROJECT=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 SERVICE_USER=swiftbot
+# Debian packages that a gateway needs.
+GATEWAY_PACKAGES=(podman runc crun uidmap slirp4netns fuse-overlayfs catatonit dbus-user-session mmdebstrap
+  python3 python3-venv rsync ca-certificates)
 
 if [ "$(id -u)" -eq 0 ]; then
   AS_ROOT=1

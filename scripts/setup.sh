@@ -41,8 +41,7 @@ for argument in "$@"; do
   esac
 done
 
-PACKAGES=(podman runc crun uidmap slirp4netns fuse-overlayfs catatonit dbus-user-session mmdebstrap
-  python3 python3-venv rsync ca-certificates)
+PACKAGES=("${GATEWAY_PACKAGES[@]}")
 [ "$MODE" = dev ] && PACKAGES+=(systemd iproute2 tmux groff-base)  # for tests: network namespaces, the UI in a terminal, manual pages
 # Gateways and recorders go by their clocks. What keeps them already is left alone, but for systemd-timesyncd, which chrony
 # replaces: it follows a clock that drifts, and tells how far off it is.

@@ -52,6 +52,11 @@ class BundleShown(Struct, frozen=True, kw_only=True):
     files: int
     bytes: int
     images: tuple[str, ...]
+    packages: int = 0
+    """Debian packages."""
+    models: tuple[str, ...] = ()
+    parts: int = 0
+    """Signed lists of parts."""
 
 
 @Parameter(name="*")
@@ -141,7 +146,7 @@ async def upgrade(
         running = next((each.version for each in layout.installed() if each.id == layout.running()), "")
         bundle.check_for(architecture=host.architecture(), python=host.python(), running=running, older=older)
         _say(f"{file}: {bundle.manifest.release}, signature good; {running or 'nothing'} runs")
-        release = await host.lay_out(bundle, layout, say=_say)
+        release = await host.lay_out(bundle, layout, config=config, say=_say)
         return _show_ended(await upgrading.to(release), as_json=as_json)
 
 
@@ -251,12 +256,20 @@ async def show_(
         files=len(manifest.members),
         bytes=manifest.size,
         images=tuple(Path(each.name).stem for each in manifest.members if each.name.startswith("images/")),
+        packages=sum(each.name.endswith(".deb") for each in manifest.members),
+        models=tuple(
+            sorted({Path(each.name).parts[1] for each in manifest.members if each.name.startswith("models/")})
+        ),
+        parts=sum(each.name.startswith("parts/") for each in manifest.members),
     )
     text = Text(
         f"{manifest.release} for {manifest.architecture}, Python {manifest.python}\n"
         f"  made     {time.strftime('%Y-%m-%d %H:%M', time.localtime(manifest.made))}\n"
         f"  files    {shown.files}, {shown.bytes / 2**20:.0f} MiB, all as the manifest says\n"
         f"  images   {', '.join(shown.images) or 'none: built on the gateway'}\n"
+        f"  Debian   {f'{shown.packages} packages' if shown.packages else 'no packages'}\n"
+        f"  models   {', '.join(shown.models) or 'none but what comes with the program'}\n"
+        f"  parts    {f'{shown.parts} signed lists' if shown.parts else 'no signed list'}\n"
         "  signed by a key that is trusted"
     )
     show(shown, as_json=as_json, table=text)

@@ -37,7 +37,7 @@ from msgspec import Struct
 
 from appliance import durable
 from appliance.config import GatewayConfig, load
-from appliance.deploy.host import command
+from appliance.deploy.command import command
 from appliance.deploy.sealed import COST_LOG2, Opener, Sealer
 from appliance.errors import ConfigError, ConflictError, PayloadError, RefusedError, SwiftbotError
 from appliance.plane.leases import FENCE

@@ -8,6 +8,9 @@ SHA-256 of every other member; then `bundle.sig`, its Ed25519 signature; then th
     systemd/, docs/   as in the source tree
     source/*.tar.gz   the source of the program
     images/*.tar      container images, as `podman save` writes them
+    packages/*.deb    Debian packages that the program needs, with all that those need, and `wanted`: their names
+    models/*/         models for the planner
+    parts/*.json      lists of parts, signed by the authorities of fleets
 
 The signature is checked before anything else of the file is believed, each member as it is taken out. The keys that a
 machine trusts are in /etc/swiftbot/release.pub, public keys in PEM, one or more: the next one can be added before the
@@ -44,7 +47,7 @@ SIGNATURE_BYTES = 64
 MOST_FILES = 10_000
 PART = 2**20
 TRUSTED = "etc/swiftbot/release.pub"
-KINDS = ("wheels", "tools", "systemd", "docs", "source", "images", "LICENSE")
+KINDS = ("wheels", "tools", "systemd", "docs", "source", "images", "packages", "models", "parts", "LICENSE")
 """First parts of members' names."""
 _PEM = re.compile(rb"-----BEGIN PUBLIC KEY-----.+?-----END PUBLIC KEY-----\n?", re.DOTALL)
 _COPY_AGAIN = "copy the bundle again, and compare its size with the original's"

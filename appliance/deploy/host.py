@@ -1,10 +1,7 @@
 """The machine under an upgrade: systemd, the service user, and how a bundle becomes a release."""
 
 import asyncio
-import contextlib
-import os
 import platform
-import pwd
 import shutil
 import sys
 import zipfile
@@ -15,11 +12,13 @@ import msgspec
 from msgspec import Struct
 
 from appliance import durable
+from appliance.config import load
+from appliance.deploy import debian
 from appliance.deploy.bundle import Bundle
+from appliance.deploy.command import command
 from appliance.deploy.layout import Layout
-from appliance.errors import PrerequisiteError, RefusedError, SwiftbotError
+from appliance.errors import RefusedError, SwiftbotError
 
-USER = "swiftbot"
 CONFIG = Path("/etc/swiftbot/gateway.toml")
 UNITS = (
     "swiftbot-gateway.service",
@@ -35,7 +34,7 @@ DOCTOR_S = 120.0
 LOAD_S = 900.0
 BUILD_S = 1800.0
 ROOM = 4.5
-"""Room that a release takes, in sizes of its bundle: wheels, what is in them, compiled modules. Measured: 4.1."""
+"""Room that wheels take, in their sizes: themselves, what is in them, compiled modules. Measured: 4.1."""
 MEMBERS = ".bundle"
 """Folder of a release that is being laid out, for the members of its bundle."""
 
@@ -121,81 +120,6 @@ class Machine:
         return {check.name: check.detail for check in checks if check.required and not check.ok}
 
 
-async def command(
-    *words: str,
-    as_user: bool = False,
-    timeout_s: float = 60.0,
-    codes: tuple[int, ...] = (0,),
-    folder: Path | None = None,
-    data: Path | None = None,
-    out: Path | None = None,
-) -> str:
-    """Run a program and return what it printed.
-
-    Args:
-        words: program and arguments.
-        as_user: as the service user, where this is root and there is such a user.
-        timeout_s: it is ended then.
-        codes: exit codes that are none of an error.
-        folder: where it runs.
-        data: file that is its standard input.
-        out: file that gets what it prints, instead of being returned.
-
-    Raises:
-        PrerequisiteError: it is not installed.
-        RefusedError: it fails, or does not end; with the end of what it said.
-    """
-    entry = _service_user() if as_user else None
-    become = (
-        ("setpriv", f"--reuid={entry.pw_uid}", f"--regid={entry.pw_gid}", "--init-groups", "--inh-caps=-all", "--")
-        if entry is not None
-        else ()
-    )
-    with contextlib.ExitStack() as stack:
-        try:
-            process = await asyncio.create_subprocess_exec(
-                *become,
-                *words,
-                stdin=asyncio.subprocess.DEVNULL if data is None else stack.enter_context(data.open("rb")),
-                stdout=asyncio.subprocess.PIPE if out is None else stack.enter_context(out.open("wb")),
-                stderr=asyncio.subprocess.PIPE,
-                cwd=folder or "/",
-                env=_environment(entry),
-            )
-        except OSError as error:
-            raise PrerequisiteError(f"{words[0]} cannot be run: {error.strerror}", remedy="swiftbot doctor") from error
-    try:
-        async with asyncio.timeout(timeout_s):
-            printed, told = await process.communicate()
-    except TimeoutError:
-        raise RefusedError(f"{' '.join(words[:3])} did not end within {timeout_s:g} s") from None
-    finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
-    if process.returncode not in codes:
-        said = (told or printed or b"").decode(errors="replace").strip()[-500:]
-        raise RefusedError(f"{' '.join(words[:3])} ended with {process.returncode}: {said}")
-    return (printed or b"").decode(errors="replace")
-
-
-def _service_user() -> pwd.struct_passwd | None:
-    """Return the user to become; None where this is not root, or there is no such user."""
-    if os.getuid() != 0:
-        return None
-    try:
-        return pwd.getpwnam(USER)
-    except KeyError:
-        return None
-
-
-def _environment(user: pwd.struct_passwd | None) -> dict[str, str]:
-    kept = {"PATH": os.environ.get("PATH", "/usr/sbin:/usr/bin:/sbin:/bin"), "LANG": "C.UTF-8"}
-    if user is not None:
-        return kept | {"HOME": user.pw_dir, "USER": user.pw_name, "XDG_RUNTIME_DIR": f"/run/user/{user.pw_uid}"}
-    return kept | {name: os.environ[name] for name in ("HOME", "XDG_RUNTIME_DIR") if name in os.environ}
-
-
 def architecture() -> str:
     """Return this machine's, as `uname -m` says it."""
     return platform.machine()
@@ -206,16 +130,25 @@ def python() -> str:
     return f"{sys.version_info.major}.{sys.version_info.minor}"
 
 
-async def lay_out(bundle: Bundle, layout: Layout, *, say: Callable[[str], None]) -> str:
-    """Make a release of a bundle, beside those that are there; returns its id. Nothing that runs is touched.
+async def lay_out(bundle: Bundle, layout: Layout, *, config: Path, say: Callable[[str], None]) -> str:
+    """Make a release of a bundle, beside those that are there; returns its id. No service is touched.
+
+    Debian packages that this machine lacks are installed. A signed list of parts for the gateway's fleet counts from
+    then on: it has to name those of the release that runs too.
+
+    Args:
+        bundle: what it is made of.
+        layout: of the machine's releases.
+        config: the gateway's.
+        say: hears of each step.
 
     Raises:
-        RefusedError: the disk has no room, or the environment cannot be made.
+        RefusedError: the disk has no room, the Debian packages cannot be installed, or the environment not be made.
         PayloadError: the bundle is cut off or damaged.
     """
     manifest = bundle.manifest
     durable.make_folder(layout.prefix, mode=0o755)
-    free, need = shutil.disk_usage(layout.prefix).free, int(manifest.size * ROOM)
+    free, need = shutil.disk_usage(layout.prefix).free, int(room(bundle))
     if free < need:
         raise RefusedError(
             f"{layout.prefix} has {free >> 20:,} MiB free, and the release needs {need >> 20:,} MiB",
@@ -227,9 +160,11 @@ async def lay_out(bundle: Bundle, layout: Layout, *, say: Callable[[str], None])
         members.mkdir()
         say(f"take out {len(manifest.members)} files, {manifest.size / 2**20:.0f} MiB")
         await asyncio.to_thread(bundle.take_out, members)
+        if (members / "packages").exists():
+            await _packages(members / "packages", layout, say=say)
         say("make its environment")
         await _environment_of(members, staged / "venv")
-        for part in ("systemd", "docs", "LICENSE"):
+        for part in ("systemd", "docs", "models", "LICENSE"):
             if (members / part).exists():
                 (members / part).rename(staged / part)
         images = sorted(members.glob("images/*.tar"))
@@ -237,6 +172,7 @@ async def lay_out(bundle: Bundle, layout: Layout, *, say: Callable[[str], None])
             say(f"load image {image.stem}")
             # Through its standard input: Podman's user cannot read this folder.
             await command("podman", "load", as_user=True, timeout_s=LOAD_S, data=image)
+        _take_parts(members / "parts", config, say=say)
         shutil.rmtree(members)
         try:
             await command(str(staged / "venv/bin/swiftbot"), "manual", str(staged / "man"))
@@ -254,6 +190,30 @@ async def lay_out(bundle: Bundle, layout: Layout, *, say: Callable[[str], None])
         except SwiftbotError as error:
             say(f"images: {error.message}")  # whether the gateway works without is for the check to say
     return release
+
+
+def room(bundle: Bundle) -> float:
+    """Bytes that laying a bundle out takes at most."""
+    return sum(each.size * (ROOM if each.name.startswith("wheels/") else 1.1) for each in bundle.manifest.members)
+
+
+async def _packages(folder: Path, layout: Layout, *, say: Callable[[str], None]) -> None:
+    """Install what this machine lacks of the Debian packages that the program needs."""
+    if layout.root.absolute() != Path("/"):
+        say(f"without Debian packages: {layout.root} is not this machine's root")
+    elif names := await debian.missing(folder):
+        await debian.install(folder, names, say=say)
+
+
+def _take_parts(folder: Path, config: Path, *, say: Callable[[str], None]) -> None:
+    """Put the newest list of parts that is for this gateway's fleet in place; those of other fleets are none of it."""
+    from appliance.deploy import parts  # noqa: PLC0415 - with the pool, which few bundles need
+
+    for file in sorted(folder.glob("*.json")):
+        try:
+            say(f"the list of parts is number {parts.install(load(config), file).number}")
+        except SwiftbotError as error:
+            say(f"without the list of parts {file.name}: {error.message}")  # what is not signed the check tells
 
 
 async def _environment_of(members: Path, venv: Path) -> None:

@@ -25,7 +25,8 @@ from msgspec import Struct
 from appliance import durable
 from appliance.config import GatewayConfig, load
 from appliance.deploy.backup import named_in
-from appliance.deploy.host import UNITS, command
+from appliance.deploy.command import command
+from appliance.deploy.host import UNITS
 from appliance.deploy.layout import Layout
 from appliance.deploy.upgrade import LAST
 from appliance.errors import ConfigError, SwiftbotError

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
@@ -18,6 +19,10 @@ import pytest
 
 from appliance.deploy.layout import Layout
 from appliance.deploy.upgrade import Ended
+from appliance.identity import parts
+from appliance.identity.authority import Authority
+from appliance.identity.parts import Parts
+from appliance.model.roles import Role
 
 PROGRAM = """
 import json, sys, time
@@ -78,12 +83,12 @@ class Box:
         """Run one."""
         return subprocess.run(self.command(*words), capture_output=True, text=True, check=False)
 
-    def changing(self, *words: str) -> list[str]:
+    def changing(self, *words: str, config: Path | None = None) -> list[str]:
         """The words of one that changes the machine."""
-        return [*words, "--root", str(self.root), "--config", str(self.folder / "none"), "--json"]
+        return [*words, "--root", str(self.root), "--config", str(config or self.folder / "none"), "--json"]
 
-    def bundle(self, version: str, program: dict[str, object]) -> Path:
-        """Make a bundle by `swiftbot release pack`."""
+    def bundle(self, version: str, program: dict[str, object], more: dict[str, bytes] | None = None) -> Path:
+        """Make a bundle by `swiftbot release pack`, with further files."""
         files, tree = self.folder / version / "files", self.folder / version / "tree"
         for name in ("wheels", "tools", "systemd", "docs"):
             (files / name).mkdir(parents=True)
@@ -100,6 +105,9 @@ class Box:
         (files / "systemd/swiftbot-gateway.service").write_text(version)
         (files / "docs/operations.md").write_text(version)
         (files / "LICENSE").write_text(version)
+        for name, data in (more or {}).items():
+            (files / name).parent.mkdir(parents=True, exist_ok=True)
+            (files / name).write_bytes(data)
         tree.mkdir()
         (tree / "pyproject.toml").write_text(f'[project]\nversion = "{version}"\n')
         out = self.folder / f"{version}.bundle"
@@ -142,6 +150,36 @@ def test_upgrade_and_rollback(box: Box) -> None:
     done = box.swiftbot(*box.changing("rollback"))
     assert done.returncode == 0, done.stderr
     assert unit.read_text() == "1.0"
+
+
+def test_models_and_signed_lists_come_with_a_bundle(box: Box, tmp_path: Path) -> None:
+    """A model is in the release and goes with it; of the lists that of the gateway's own fleet counts."""
+    lists: dict[str, bytes] = {}
+    for number, fleet in enumerate(("mill", "yard")):
+        authority = Authority.create(tmp_path / fleet, fleet, datetime.now(UTC))
+        authority.sign_parts(Parts(skill={"goto": ("1" * 64,)}))
+        lists[f"parts/{number}.json"] = (authority.folder / parts.FILE).read_bytes()
+    authority.issue(Role.GATEWAY, "gw-1", out=tmp_path / "yard/gateway.pem")
+    config = tmp_path / "gateway.toml"
+    (tmp_path / "yard" / parts.FILE).unlink()
+    config.write_text(
+        f'fleet = "yard"\nid = "gw-1"\ndata_dir = "{tmp_path}/data"\n[plane]\nkeys = "{tmp_path}/yard/gateway.pem"\n'
+        'listen = ["tls/127.0.0.1:7447"]\n'
+    )
+    more = lists | {"models/small/model.onnx": b"weights", "packages/wanted": b"podman\n"}
+    file = box.bundle("1.1", GOOD, more)
+    done = box.swiftbot(*box.changing("upgrade", str(file), config=config))
+    assert done.returncode == 0, done.stderr
+    assert (box.layout.current / "models/small/model.onnx").read_bytes() == b"weights"
+    assert not (box.layout.current / "parts").exists()
+    assert (tmp_path / "yard" / parts.FILE).read_bytes() == lists["parts/1.json"]
+    for said in ("without the list of parts 0.json", "the list of parts is number 1", "is not this machine's root"):
+        assert said in done.stderr
+    assert box.swiftbot(*box.changing("rollback")).returncode == 0
+    assert not (box.layout.current / "models").exists()
+    shown = box.swiftbot("release", "show", str(file), "--trusted", str(tmp_path / "key.pub"))
+    for said in ("models   small", "parts    2 signed lists", "Debian   no packages"):
+        assert said in shown.stdout
 
 
 def test_a_release_that_finds_itself_wrong_is_undone(box: Box) -> None:
