@@ -155,8 +155,9 @@ def _way(here: Point, goal: Point, site: Site, *, flies: bool) -> list[Point]:
     """Return the way as `_lib.moves.plan_way` does."""
     forbidden = paths.rectangles(msgspec.to_builtins(site.forbidden))
     obstacles = paths.rectangles(msgspec.to_builtins(site.obstacles))
+    aisles = [] if flies else paths.one_ways(msgspec.to_builtins(site.aisles))
     try:
-        return paths.plan(here, goal, [*obstacles, *forbidden])
+        return paths.plan(here, goal, [*obstacles, *forbidden], aisles=aisles)
     except paths.NoPath:
         if not flies:
             raise
@@ -203,13 +204,17 @@ def _nearest(begin: Point, end: Point, point: Point) -> float:
 
 
 def unreachable(site: Site) -> tuple[str, ...]:
-    """Return the places to which no robot on the ground finds a way from the site's first place, with why."""
+    """Return the places to which, or from which, no robot on the ground finds a way, with why.
+
+    The other end is the site's first place.
+    """
     names = list(site.places)
     found: list[str] = []
     for name in names[1:]:
         first, place = site.places[names[0]], site.places[name]
-        try:
-            _way((first.x, first.y), (place.x, place.y), site, flies=False)
-        except paths.NoPath as error:
-            found.append(f"{name}: no way from {names[0]} ({error.message})")
+        for word, start, end in (("from", first, place), ("to", place, first))[: 2 if site.aisles else 1]:
+            try:
+                _way((start.x, start.y), (end.x, end.y), site, flies=False)
+            except paths.NoPath as error:
+                found.append(f"{name}: no way {word} {names[0]} ({error.message})")
     return tuple(found)

@@ -16,7 +16,7 @@ from appliance.errors import Exit
 from appliance.estimate import unreachable
 from appliance.model import Site
 from appliance.skills.sites import load_site
-from appliance.tui.widgets.map import Area, draw
+from appliance.tui.widgets.map import areas_of, draw
 
 site_app = App(name="site", help="Check and show site files: places, obstacles, fence, limits.", group=TOOLS)
 NEAR_M = 0.5
@@ -44,7 +44,7 @@ def site_check(file: Path, /, *, as_json: Json = False) -> int:
     """Check a site file. Exit code 5: it cannot be loaded, with file and key; 1: it loads, with warnings.
 
     A gateway that is given a file with errors does not start. Warnings are a missing fence, places that no robot on the
-    ground can reach, and places that lie on each other.
+    ground can reach, or from which none can return along one-way aisles, and places that lie on each other.
 
     Args:
         file: TOML file such as yard.toml, or the name of a site that comes with the product.
@@ -53,6 +53,7 @@ def site_check(file: Path, /, *, as_json: Json = False) -> int:
     found = SiteChecked(site=site.name, places=len(site.places), warnings=tuple(warnings(site)))
     lines = [
         f"{site.name}: {len(site.places)} places, {len(site.obstacles)} obstacles, {len(site.forbidden)} forbidden"
+        + (f", {len(site.aisles)} one-way aisles" if site.aisles else "")
     ]
     lines += [f"warning: {each}" for each in found.warnings] or ["no errors, no warnings"]
     show(found, as_json=as_json, table=Text("\n".join(lines)))
@@ -91,9 +92,7 @@ async def site_show(
 def site_text(site: Site) -> Group:
     """Return a site as a map, its limits, and a table of its places."""
     places = {name: (each.x, each.y) for name, each in site.places.items()}
-    areas = [Area(x=each.x, y=each.y) for each in site.obstacles]
-    areas += [Area(x=each.x, y=each.y, forbidden=True) for each in site.forbidden]
-    lines = draw((), *MAP, places=places, areas=areas)
+    lines = draw((), *MAP, places=places, areas=areas_of(site))
     scale = lines[-1].plain.partition("N↑")[0]
     picture = Text("\n").join([*(Text.assemble(*line.pieces) for line in lines[:-1]), Text(f"{scale}N↑", "dim")])
     fence = site.fence

@@ -153,6 +153,7 @@ class Floor:
         outside = _outside(site.fence) if site.fence is not None else ()
         self._closed = [*outside, *(_rectangle(box) for box in (*site.forbidden, *site.obstacles))]
         self._forbidden = [*outside, *(_rectangle(box) for box in site.forbidden)]
+        self._aisles = [paths.OneWay(_rectangle(each), each.one_way) for each in site.aisles]
 
     def problems(self, radius_m: float) -> tuple[str, ...]:
         """Return what about the map keeps robots of that radius from their places, in words."""
@@ -166,6 +167,10 @@ class Floor:
             walls = [wall.name for wall in self._closed if wall.grown(radius_m).holds(self._centre(one))]
             if walls:
                 found.append(f"{one} is nearer to {walls[0]} than {radius_m:g} m: a robot there touches it")
+        for aisle in self.site.aisles:
+            low, high = aisle.y if aisle.one_way in ("east", "west") else aisle.x
+            if high - low < 2 * radius_m:
+                found.append(f"{aisle.name} is {high - low:g} m wide: a robot of {radius_m:g} m radius is wider")
         return tuple(found)
 
     # --- may it go? -------------------------------------------------------------------------------------------
@@ -207,6 +212,9 @@ class Floor:
             if way is not None and avoid:
                 way = self._round(me, points, walls, [bodies[each] for each in avoid if each in bodies], trip) or way
         if way is None and not standing:
+            if not trip.flies and any(each.against(*leg) for each in self._aisles for leg in _legs(straight)):
+                why = f"finds no way to ({goal[0]:g}, {goal[1]:g}) that keeps to the one-way aisles"
+                return Wait(robot="", why=why, place=place, way=straight)
             way = straight  # the map closes it: the robot's side says so
         if way is None:
             nearest = min(standing, key=lambda each: geometry.from_way(each.at[:2], straight))
@@ -395,7 +403,7 @@ class Floor:
         for number, point in enumerate(points):
             if number < len(points) - 1 and any(wall.holds(point[:2]) for wall in near):
                 continue
-            if paths.free(way[-1][:2], point[:2], near) and paths.free(way[-1][:2], point[:2], map_walls):
+            if paths.straight(way[-1][:2], point[:2], [*near, *map_walls], () if flies else self._aisles):
                 way.append(point)
                 continue
             try:
@@ -408,8 +416,9 @@ class Floor:
     def _plan(
         self, start: Flat, goal: Flat, walls: Sequence[paths.Rectangle], *, flies: bool, kept_m: float
     ) -> list[Flat]:
+        aisles = () if flies else self._aisles
         try:
-            return paths.plan(start, goal, [*self._closed, *walls], clearance=kept_m, tries=1)
+            return paths.plan(start, goal, [*self._closed, *walls], aisles=aisles, clearance=kept_m, tries=1)
         except paths.NoPath:
             if not flies:
                 raise
@@ -484,6 +493,10 @@ def threat(way: Sequence[Point], me: Body, bodies: Iterable[Body]) -> Body | Non
         if geometry.from_way(each.at[:2], way) < apart:
             return each
     return None
+
+
+def _legs(way: Sequence[Point]) -> Iterable[tuple[Flat, Flat]]:
+    return ((start[:2], end[:2]) for start, end in pairwise(way))
 
 
 def _go(way: tuple[Point, ...], size: Size, *, place: str = "") -> Go:

@@ -35,7 +35,7 @@ from appliance.model.plans import (
     plan_hash,
 )
 from appliance.model.robots import Pose, RobotCommand, RobotInfo, RobotLimits, RobotReply
-from appliance.model.site import Box, Device, Door, Person, Place, Site, SiteObject
+from appliance.model.site import Aisle, Box, Device, Door, Person, Place, Site, SiteObject
 from appliance.model.steering import Act, Approval, Decision, Enquiry, Lease, Lifted, Pause, Signed, SoftStop, Word
 from appliance.model.tasks import (
     HIGHEST_PRIORITY,
@@ -74,6 +74,7 @@ __all__ = [
     "PLAIN_PRIORITY",
     "SPLIT",
     "Act",
+    "Aisle",
     "Approval",
     "Attempt",
     "Box",

@@ -34,6 +34,12 @@ class Box(Struct, frozen=True, kw_only=True, omit_defaults=True):
     y: tuple[float, float]
 
 
+class Aisle(Box, frozen=True, kw_only=True, omit_defaults=True):
+    """An aisle, or a lane of one, that robots on the ground go along in one direction only; across it is free."""
+
+    one_way: Literal["north", "east", "south", "west"]
+
+
 class SiteObject(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A thing that the simulated world holds: colour name, size in metres, where it is at first."""
 
@@ -84,6 +90,8 @@ class Site(Struct, frozen=True, kw_only=True, omit_defaults=True):
     places: dict[str, Place] = field(default_factory=dict[str, Place])
     obstacles: tuple[Box, ...] = ()
     forbidden: tuple[Box, ...] = ()
+    aisles: tuple[Aisle, ...] = ()
+    """One-way aisles and lanes."""
     objects: tuple[SiteObject, ...] = ()
     altitude_limit_m: float = 60.0
     speed_limit_mps: float = 8.0

@@ -7,13 +7,14 @@ wrong spot. So names, aliases and coordinates are checked before anything moves.
 import math
 import re
 import tomllib
+from itertools import combinations
 from pathlib import Path
 from typing import Any, cast
 
 import msgspec
 
 from appliance.errors import ConfigError
-from appliance.model import Box, Device, Door, Person, Place, Site, SiteObject
+from appliance.model import Aisle, Box, Device, Door, Person, Place, Site, SiteObject
 from appliance.model.site import inside
 from appliance.skills.catalogue import SKILLS, convert
 
@@ -55,6 +56,7 @@ def plain_name(name: str) -> str:
 _LISTS: tuple[tuple[str, type[msgspec.Struct]], ...] = (
     ("obstacles", Box),
     ("forbidden", Box),
+    ("aisles", Aisle),
     ("objects", SiteObject),
     ("doors", Door),
     ("devices", Device),
@@ -115,6 +117,7 @@ def _check_things(file: Path, site: Site) -> None:
     for key, boxes in (
         ("obstacles", site.obstacles),
         ("forbidden", site.forbidden),
+        ("aisles", site.aisles),
         ("doors", site.doors),
         ("fence", fence),
     ):
@@ -122,6 +125,7 @@ def _check_things(file: Path, site: Site) -> None:
             for axis, (low, high) in (("x", box.x), ("y", box.y)):
                 if not (math.isfinite(low) and math.isfinite(high) and low < high):
                     raise _wrong(file, f"{key}[{index}].{axis}", f"{box.name!r}: [{low}, {high}] is no extent")
+    _check_aisles(file, site)
     names: set[str] = set()
     for index, thing in enumerate(site.objects):
         if thing.name in names:
@@ -138,6 +142,17 @@ def _check_things(file: Path, site: Site) -> None:
         if each.name in names:
             raise _wrong(file, f"{key}.{each.name}", "something else has that name")
         names.add(each.name)
+
+
+def _check_aisles(file: Path, site: Site) -> None:
+    opposite = {"north": "south", "south": "north", "east": "west", "west": "east"}
+    for (first, one), (second, other) in combinations(enumerate(site.aisles), 2):
+        if one.name == other.name:
+            raise _wrong(file, f"aisles[{second}].name", f"there are two of {one.name!r}")
+        shared = all(max(a[0], b[0]) < min(a[1], b[1]) for a, b in ((one.x, other.x), (one.y, other.y)))
+        if shared and other.one_way == opposite[one.one_way]:
+            what = f"{other.name!r} overlaps {one.name!r} (aisles[{first}]), which goes the other way"
+            raise _wrong(file, f"aisles[{second}]", f"{what}: draw two lanes side by side")
 
 
 def _wrong(file: Path, key: str, what: str) -> ConfigError:

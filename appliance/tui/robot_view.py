@@ -26,7 +26,7 @@ from appliance.tui.formatting import Cell, hanging
 from appliance.tui.safe import safe
 from appliance.tui.store import Gateway, Store
 from appliance.tui.subscriptions import View
-from appliance.tui.widgets.map import Area, Line, Spot, draw, view_for
+from appliance.tui.widgets.map import Area, Line, Spot, areas_of, draw, view_for
 from appliance.tui.widgets.map import View as MapView
 
 TRAIL = 60
@@ -282,12 +282,8 @@ def spots(robots: Sequence[Robot], trails: Trails, *, selected: str = "") -> lis
 
 
 def areas(site: Site | None) -> list[Area]:
-    """Return a site's obstacles and forbidden areas."""
-    if site is None:
-        return []
-    return [Area(x=each.x, y=each.y) for each in site.obstacles] + [
-        Area(x=each.x, y=each.y, forbidden=True) for each in site.forbidden
-    ]
+    """Return a site's obstacles, forbidden areas and one-way aisles."""
+    return areas_of(site) if site is not None else []
 
 
 def places(site: Site | None, closed: Collection[str] = ()) -> dict[str, tuple[float, float]]:

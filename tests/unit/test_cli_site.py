@@ -54,6 +54,53 @@ def test_what_is_most_likely_a_mistake_is_a_warning(capsys: pytest.CaptureFixtur
     assert closed.startswith("hall: no way from gate")
 
 
+def test_a_place_that_one_way_aisles_cut_off_is_a_warning(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """A hall whose only aisle leads in: nobody comes back."""
+    file = tmp_path / "yard.toml"
+    file.write_text("""
+[fence]
+name = "fence"
+x = [-1.0, 21.0]
+y = [-1.0, 1.0]
+[[aisles]]
+name = "the only aisle"
+x = [5.0, 15.0]
+y = [-5.0, 5.0]
+one_way = "east"
+[[obstacles]]
+name = "south"
+x = [5.0, 15.0]
+y = [-40.0, -1.0]
+[[obstacles]]
+name = "north"
+x = [5.0, 15.0]
+y = [1.0, 40.0]
+[[obstacles]]
+name = "round the hall"
+x = [25.0, 26.0]
+y = [-40.0, 40.0]
+[[obstacles]]
+name = "south of the hall"
+x = [15.0, 25.0]
+y = [-40.0, -39.0]
+[[obstacles]]
+name = "north of the hall"
+x = [15.0, 25.0]
+y = [39.0, 40.0]
+[places.gate]
+x = 0.0
+y = 0.0
+[places.hall]
+x = 20.0
+y = 0.0
+""")
+    code, out, _ = run(capsys, "site", "check", str(file), "--json")
+    (warning,) = json.loads(out)["warnings"]
+    assert code == 1
+    assert warning.startswith("hall: no way to gate")
+    assert "against 'the only aisle', one-way to the east" in warning
+
+
 def test_a_broken_file_names_file_and_key(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """As a gateway would refuse it, before one is started with it."""
     file = tmp_path / "yard.toml"

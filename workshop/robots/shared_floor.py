@@ -93,6 +93,9 @@ class FloorSimulation:
         self._closed = paths.rectangles(
             [{"name": box.name, "x": box.x, "y": box.y} for box in (*site.obstacles, *site.forbidden)]
         )
+        self._aisles = [
+            paths.OneWay(paths.Rectangle(each.name, *each.x, *each.y), each.one_way) for each in site.aisles
+        ]
         start = "charger" if "charger" in site.places else next(iter(site.places), "")
         self.robots = [_Robot(f"rover_{number + 1}", start_point(site, start, spot=number)) for number in range(robots)]
         self.now = 0.0
@@ -207,7 +210,7 @@ class FloorSimulation:
         place = self._random.choice(places)
         robot.number += 1
         try:
-            way = paths.plan(here, (place.x, place.y), self._closed)
+            way = paths.plan(here, (place.x, place.y), self._closed, aisles=self._aisles)
         except paths.NoPath:
             robot.free_at = self.now + 1.0
             return

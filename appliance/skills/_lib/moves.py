@@ -55,7 +55,9 @@ def speed(ctx: Context, *, default: float | None = None) -> float:
 
 
 def plan_way(ctx: Context, start: paths.Point, goal: Spot, *, flies: bool = False) -> list[paths.Point]:
-    """Return the waypoints to a spot around obstacles and forbidden areas; ctx.Fail when there is no way.
+    """Return the waypoints to a spot around obstacles and forbidden areas, on the ground along one-way aisles.
+
+    ctx.Fail when there is no way.
 
     A robot that flies goes round obstacles too where it can (the map gives them no height), over them where the
     start or the goal leaves no other way, and never over a forbidden area.
@@ -77,8 +79,9 @@ def reachable(ctx: Context, before: State, goal: Spot) -> bool:
 def _way(ctx: Context, start: paths.Point, goal: Spot, *, flies: bool) -> list[paths.Point]:
     forbidden = paths.rectangles(ctx.site.get("forbidden") or ())
     obstacles = paths.rectangles(ctx.site.get("obstacles") or ())
+    aisles = [] if flies else paths.one_ways(ctx.site.get("aisles") or ())
     try:
-        return paths.plan(start, (goal.x, goal.y), [*obstacles, *forbidden])
+        return paths.plan(start, (goal.x, goal.y), [*obstacles, *forbidden], aisles=aisles)
     except paths.NoPath:
         if not flies:
             raise

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from msgspec import Struct
 from rich.cells import cell_len
 
+from appliance.model import Site
 from appliance.tui.safe import safe
 
 _DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
@@ -74,6 +75,10 @@ class Canvas:
                 taken[more] = 1
             column += width
 
+    def mark(self, row: int, column: int, sign: str, style: str) -> None:
+        """Write a sign that others may be written over."""
+        self._signs[row][column] = (sign, style)
+
     def lines(self) -> list[Line]:
         """Return the rows."""
         return [self._line(row) for row in range(self.rows)]
@@ -107,6 +112,8 @@ MOST_M = 1e7
 """A position further off than this is a fault of its sender, and would shrink the others to a dot."""
 MOST_NAMES = 100
 """Robots, or cells with several, that are named where there is room."""
+ARROWS_EVERY = 4
+"""Cells from one arrow of an aisle to the next."""
 TOO_WIDE = 2.0
 """So much wider than needed a view may be before it is fitted again."""
 _ARROWS = "↑↗→↘↓↙←↖"
@@ -130,6 +137,17 @@ class Area(Struct, frozen=True, kw_only=True):
     x: tuple[float, float]
     y: tuple[float, float]
     forbidden: bool = False
+    one_way: str = ""
+    """Of an aisle: `north`, `east`, `south` or `west`."""
+
+
+def areas_of(site: Site) -> list[Area]:
+    """Return a site's obstacles, forbidden areas and one-way aisles."""
+    return [
+        *(Area(x=each.x, y=each.y) for each in site.obstacles),
+        *(Area(x=each.x, y=each.y, forbidden=True) for each in site.forbidden),
+        *(Area(x=each.x, y=each.y, one_way=each.one_way) for each in site.aisles),
+    ]
 
 
 class View(Struct, frozen=True, kw_only=True):
@@ -228,7 +246,7 @@ def draw(
         columns: cells of a line.
         rows: lines, the scale among them.
         places: named places of the site.
-        areas: obstacles and forbidden areas.
+        areas: obstacles, forbidden areas and one-way aisles.
         selected: the robot that is marked.
         view: what is shown, for a map of this size; without it all there is.
     """
@@ -240,7 +258,10 @@ def draw(
         view = view_for(shown, columns, rows, places=known, areas=boxes)
     canvas = Canvas(columns, rows - 1)
     for box in boxes:
-        _outline(canvas, view, box)
+        if box.one_way:
+            _arrows(canvas, view, box)
+        else:
+            _outline(canvas, view, box)
     for each in shown:
         for x, y in each.trail:
             if _real(x, y):
@@ -261,6 +282,21 @@ def _outline(canvas: Canvas, view: View, box: Area) -> None:
     for row in range(bottom, top + 1, step):
         canvas.dot(left, row, style)
         canvas.dot(right, row, style)
+
+
+def _arrows(canvas: Canvas, view: View, aisle: Area) -> None:
+    """Draw an aisle as arrows along its middle; what is written later goes over them."""
+    (x0, x1), (y0, y1) = aisle.x, aisle.y
+    across = aisle.one_way in ("east", "west")
+    sign = {"north": "↑", "east": "→", "south": "↓", "west": "←"}[aisle.one_way]
+    apart = ARROWS_EVERY * view.metres * (2 if across else 4)
+    count = max(1, round((x1 - x0 if across else y1 - y0) / apart))
+    for number in range(min(count, canvas.columns + canvas.rows)):
+        share = (number + 0.5) / count
+        x, y = (x0 + share * (x1 - x0), (y0 + y1) / 2) if across else ((x0 + x1) / 2, y0 + share * (y1 - y0))
+        cell = canvas.cell(*view.dot(x, y))
+        if cell is not None:
+            canvas.mark(*cell, sign, "dim")
 
 
 def _robots(canvas: Canvas, view: View, robots: Sequence[Spot], selected: str) -> None:

@@ -123,3 +123,72 @@ def test_a_position_that_is_none_is_refused() -> None:
     """NaN from a robot without a fix is refused before anything is computed."""
     with pytest.raises(paths.NoPath, match="no position"):
         paths.plan((math.nan, 0.0), (1.0, 1.0), [])
+
+
+VECTORS = {"east": (1.0, 0.0), "west": (-1.0, 0.0), "north": (0.0, 1.0), "south": (0.0, -1.0)}
+
+
+def runs_against(aisle: paths.OneWay, one: paths.Point, other: paths.Point) -> bool:
+    """Whether a leg is in an aisle somewhere and goes against it: by a check of its own."""
+    x, y = VECTORS[aisle.direction]
+    return (other[0] - one[0]) * x + (other[1] - one[1]) * y < -0.01 and crosses(aisle.area, one, other)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    start=point,
+    goal=point,
+    closed=st.lists(boxes(), max_size=4),
+    aisles=st.lists(st.builds(paths.OneWay, boxes(), st.sampled_from(sorted(VECTORS))), min_size=1, max_size=5),
+)
+def test_a_way_never_runs_against_a_one_way_aisle(
+    start: paths.Point, goal: paths.Point, closed: list[paths.Rectangle], aisles: list[paths.OneWay]
+) -> None:
+    """No leg does, nor crosses an obstacle; else the planner names the aisles that are in the way."""
+    assume(not any(box.holds(start) or box.holds(goal) for box in closed))
+    assume(math.dist(start, goal) > paths.NUDGE_M)
+    try:
+        way = paths.plan(start, goal, closed, aisles=aisles)
+    except paths.NoPath as none:
+        named = any(repr(each.area.name) in none.message for each in aisles)
+        told = (" but against " in none.message, bool(none.remedy))
+        assert told == (named, True)
+        return
+    assert way[-1] == goal
+    for one, other in pairwise([start, *way]):
+        assert not any(crosses(box, one, other) for box in closed)
+        assert not any(runs_against(each, one, other) for each in aisles)
+
+
+def lanes() -> list[paths.OneWay]:
+    """Return two lanes side by side between the racks: the south one to the east, the north one to the west."""
+    south, north = paths.Rectangle("lane 1", 10, 30, 10, 12), paths.Rectangle("lane 2", 10, 30, 12, 14)
+    return [paths.OneWay(south, "east"), paths.OneWay(north, "west")]
+
+
+def test_each_way_has_its_lane() -> None:
+    """There and back lead through other lanes."""
+    racks = [paths.Rectangle("rack a", 10, 30, 0, 10), paths.Rectangle("rack b", 10, 30, 14, 24)]
+    there = paths.plan((5.0, 12.0), (35.0, 12.5), racks, aisles=lanes())
+    back = paths.plan((35.0, 12.5), (5.0, 12.0), racks, aisles=lanes())
+    inside = [[y for x, y in way if 10 < x < 30] for way in (there, back)]
+    assert all(y <= 12.0 for y in inside[0])
+    assert all(y >= 12.0 for y in inside[1])
+
+
+def test_a_robot_just_beyond_its_goal_turns_round() -> None:
+    """Half a metre against an aisle is no way through it; more leads round."""
+    aisles = [paths.OneWay(paths.Rectangle("aisle", 0, 40, 0, 4), "east")]
+    assert paths.plan((20.4, 2.0), (20.0, 2.0), [], aisles=aisles) == [(20.0, 2.0)]
+    assert len(paths.plan((22.0, 2.0), (20.0, 2.0), [], aisles=aisles)) > 1
+
+
+def test_an_aisle_without_another_way_back_is_named() -> None:
+    """A dead end that is one-way: who is in it finds no way out."""
+    walls = [paths.Rectangle("south", 10, 30, 0, 10), paths.Rectangle("north", 10, 30, 12, 24),
+             paths.Rectangle("end", 30, 32, 0, 24)]  # fmt: skip
+    aisles = [paths.OneWay(paths.Rectangle("aisle 3", 10, 30, 10, 12), "east")]
+    assert paths.plan((5.0, 11.0), (28.0, 11.0), walls, aisles=aisles)
+    with pytest.raises(paths.NoPath, match="but against 'aisle 3', one-way to the east") as none:
+        paths.plan((28.0, 11.0), (5.0, 11.0), walls, aisles=aisles)
+    assert "one_way" in none.value.remedy

@@ -40,6 +40,13 @@ at = "gate 1"
 """
 
 
+AISLE = """[[aisles]]
+name = "lane"
+x = [5, 8]
+y = [3, 5]
+"""
+
+
 def test_a_file_of_one_s_own_is_read(tmp_path: Path) -> None:
     """A path gives the site of that file."""
     (tmp_path / "yard.toml").write_text(SITE)
@@ -61,6 +68,16 @@ def test_a_file_of_one_s_own_is_read(tmp_path: Path) -> None:
         ("x = [3, 5]", "x = [3, 5, 7]", "obstacles[0].x: "),
         ("x = [3, 5]", "x = [0, 5]\nz = [0, 5]", "obstacles[0].z: unknown key"),
         ("x = [3, 5]\ny = [3, 5]", "x = [0, 5]\ny = [0, 5]", "places.home: lies inside 'rack'"),
+        ("[[objects]]", f"{AISLE}[[objects]]", "aisles[0].one_way: "),
+        ("[[objects]]", f'{AISLE}one_way = "up"\n[[objects]]', "aisles[0].one_way: "),
+        ("[[objects]]", f'{AISLE}one_way = "east"\nspeed = 1\n[[objects]]', "aisles[0].speed: unknown key"),
+        ("[[objects]]", f'{AISLE}one_way = "east"\n[[objects]]'.replace("8]", "5]"), "aisles[0].x: "),
+        (
+            "[[objects]]",
+            f'{AISLE}one_way = "east"\n{AISLE}one_way = "west"\n[[objects]]'.replace("lane", "lane 2", 1),
+            "aisles[1]: 'lane' overlaps 'lane 2' (aisles[0]), which goes the other way",
+        ),
+        ("[[objects]]", f'{AISLE}one_way = "east"\n' * 2 + "[[objects]]", "aisles[1].name: there are two of 'lane'"),
         ('at = "gate 1"', 'at = "dock 9"', "objects[0].at: there is no place 'dock 9'"),
         ('at = "gate 1"', 'at = "gate 1"\nsize = 0', "objects[0].size: "),
         ('name = "yard"', 'name = "yard"\nspeed_limit_mps = 0', "speed_limit_mps: "),

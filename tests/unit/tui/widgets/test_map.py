@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
@@ -18,7 +19,13 @@ SPOTS = st.builds(
     heading_deg=st.none() | NUMBERS,
     trail=st.lists(st.tuples(NUMBERS, NUMBERS), max_size=4).map(tuple),
 )
-AREAS = st.builds(Area, x=st.tuples(NUMBERS, NUMBERS), y=st.tuples(NUMBERS, NUMBERS), forbidden=st.booleans())
+AREAS = st.builds(
+    Area,
+    x=st.tuples(NUMBERS, NUMBERS),
+    y=st.tuples(NUMBERS, NUMBERS),
+    forbidden=st.booleans(),
+    one_way=st.sampled_from(("", "north", "east", "south", "west")),
+)
 
 
 def shown(lines: list[object]) -> str:
@@ -128,3 +135,15 @@ def test_a_crowd_is_drawn() -> None:
     assert all(cell_len(line.plain) == 40 for line in lines)
     assert "r499" in shown(list(lines))
     assert all(len(pieces) for pieces in (line.pieces for line in lines))
+
+
+@pytest.mark.parametrize(("one_way", "arrow"), [("north", "↑"), ("east", "→"), ("south", "↓"), ("west", "←")])
+def test_an_aisle_is_drawn_as_arrows(one_way: str, arrow: str) -> None:
+    """Along its middle, and nothing else; a robot in it is drawn over them."""
+    aisle = Area(x=(0.0, 20.0), y=(0.0, 20.0), one_way=one_way)
+    lines = draw((), 40, 21, areas=[aisle])
+    drawn = "".join(line.plain for line in lines[:-1]).replace(" ", "")
+    assert set(drawn) == {arrow}
+    assert len(drawn) > 2
+    robot = Spot(name="rover_1", x=10.0, y=10.0)
+    assert "rover_1" in "".join(line.plain for line in draw([robot], 40, 21, areas=[aisle]))
