@@ -741,6 +741,7 @@ class Gateway:
             queue=self.pool.queue,
             tasks=self.manager.unfinished,
             tasks_waiting=self.manager.waiting,
+            work=self.manager.scheduler.work(),
             draining=self._draining or self.executor.draining,
             drain=self.migration.draining.text,
             overloaded=self.migration.shedding.reason,

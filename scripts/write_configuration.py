@@ -31,6 +31,7 @@ SECTIONS = (
     ("floor.robots", "appliance.floor.settings", "SizeConfig"),
     ("record", "appliance.record.settings", "RecordConfig"),
     ("tasks", "appliance.tasks.settings", "TasksConfig"),
+    ("tasks.battery", "appliance.tasks.settings", "BatteryConfig"),
     ("tasks.detection", "appliance.tasks.settings", "DetectionConfig"),
     ("tasks.replan", "appliance.tasks.settings", "ReplanConfig"),
     ("tasks.migration", "appliance.tasks.settings", "MigrationConfig"),

@@ -172,6 +172,19 @@ OLDEST_PROTOCOL = 1
 gateway after another."""
 
 
+class RobotWork(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What a task still has to do with a robot, as its coordinator tells it."""
+
+    robot: str
+    task: str
+    takes_s: float = 0.0
+    """As long as that is expected to take."""
+
+
+MOST_WORK = 200
+"""Rows of `GatewayStatus.work`."""
+
+
 class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A gateway's own account of itself, pushed on change and every few seconds."""
 
@@ -202,6 +215,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Tasks it coordinates that have not ended."""
     tasks_waiting: int = 0
     """Of these, those that wait for their turn."""
+    work: tuple[RobotWork, ...] = ()
+    """What the tasks that it coordinates have for robots; at most `MOST_WORK`."""
     draining: bool = False
     drain: str = ""
     """While it drains: how far it is, and what the runs that are left wait for."""

@@ -418,6 +418,7 @@ class Decider:
             )
             return
         robots: tuple[str, ...] = ()
+        reason = ""
         if subtask.robot is not None:
             robots, reason = context.scheduler.bind(self.record, target)
             if not robots:
@@ -443,7 +444,7 @@ class Decider:
             gateway=turn.gateway,
             robot=robot,
             others=others,
-            placed=clean(placement.why, MAX_NOTE),
+            placed=clean(f"{placement.why}; robot: {reason}" if reason else placement.why, MAX_NOTE),
             **self._figures(turn.gateway),
         )
         self._sent_at[subtask.id] = now

@@ -201,7 +201,7 @@ def _waits(
     candidates += [CandidateWhy(gateway=each, excluded=text) for each, text in placement.excluded.items()]
     if place.position:
         reason = f"room at {', '.join(placement.order)}"
-    elif not reason:
+    elif robots or not reason:
         reason = target.note or "nothing: it is being sent"
     return Waits(
         reason=reason.removeprefix(WAITS),

@@ -493,6 +493,8 @@ class TaskManager:
             hindrance=commands.hindrance,
             closed=self._closed,
             shuns=decomposer.memory.experience.shuns,
+            site=site,
+            expected=decomposer.memory.experience.expected_s,
         )
         self._ahead = LookAhead(
             plane,

@@ -56,6 +56,7 @@ from appliance.model import (
     Group,
     Need,
     RobotInfo,
+    Subtask,
     SubtaskRecord,
     SubtaskState,
     TaskRecord,
@@ -309,6 +310,11 @@ def without(group: Group, gateway: str, order: Sequence[str]) -> Group:
     return replace(group, members=members, root=root, number=group.number + 1, why=f"{gateway} is gone")
 
 
+Choose = Callable[
+    [Sequence[RobotInfo], Sequence[Subtask], Mapping[str, tuple[bool, bool]], Mapping[str, str]], tuple[list[str], str]
+]
+"""Robots that can do it, what is to be done, whether each has something else to do in the task and keeps failing at it,
+and why others may not be commanded -> the robots, best first, and why; or none and the reason for the wait."""
 _ANY = re.compile(r"any\d{0,2}")
 """Labels for a robot to be chosen; a robot may be called `anymal_1`."""
 
@@ -472,9 +478,10 @@ def bind(labels: Sequence[str], choose: Callable[[str], tuple[Sequence[str], str
         choose: the robots that one may be, best first, or none and the reason for the wait: `candidates`.
 
     Returns:
-        The robots in the order of the labels and "", or none and the reason for the wait.
+        The robots in the order of the labels, and why where there is one; or none and the reason for the wait.
     """
     fits: dict[str, Sequence[str]] = {}
+    reason = ""
     for label in labels:
         fits[label], reason = choose(label)
         if not fits[label]:
@@ -485,7 +492,7 @@ def bind(labels: Sequence[str], choose: Callable[[str], tuple[Sequence[str], str
             able = sorted({robot for robots in fits.values() for robot in robots})
             return (), f"waits for {len(labels)} different robots: there is {', '.join(able)}"
     robots = {label: robot for robot, label in taken.items()}
-    return tuple(robots[label] for label in labels), ""
+    return tuple(robots[label] for label in labels), reason if len(labels) == 1 else ""
 
 
 def candidates(
@@ -499,6 +506,7 @@ def candidates(
     hindrance: Callable[[str], str] = lambda _: "",
     shuns: Callable[[SubtaskRecord, str], str] = lambda _subtask, _robot: "",
     lost_ns: Mapping[str, int] | None = None,
+    choose: Choose | None = None,
 ) -> tuple[list[str], str]:
     """Return the robots that `any`, `any1`, ... may be, best first; for a named or bound one that one alone.
 
@@ -512,9 +520,10 @@ def candidates(
         hindrance: why tasks may not command a robot just now: a soft stop, a lease; "" when they may.
         lost_ns: when robots that are offline were lost, Unix nanoseconds, as far as that is known.
         shuns: why a robot should not be given a subtask while another can do it, by experience; "" if nothing is.
+        choose: takes one of several by what they would cost; None: one that is free, by name.
 
     Returns:
-        The robots and "", or none and the reason for the wait.
+        The robots and, where they were chosen by their cost, why; or none and the reason for the wait.
     """
     mine = [each for each in records if label in each.subtask.robots]
     # What is not done yet counts first: another robot may have taken over from the one that did the rest.
@@ -552,8 +561,11 @@ def candidates(
     able = [each for each in able if each.id not in hindered]
     shunned = {robot.id: any(shuns(each, robot.id) for each in mine if not each.state.final) for robot in able}
     # One that is busy becomes free; one that keeps failing goes on failing.
-    able.sort(key=lambda robot: (robot.id in taken | named, shunned[robot.id], robot.id in busy, robot.id))
-    return [each.id for each in able], ""
+    if choose is None:
+        able.sort(key=lambda robot: (robot.id in taken | named, shunned[robot.id], robot.id in busy, robot.id))
+        return [each.id for each in able], ""
+    open_ones = [each.subtask for each in mine if not each.state.final]
+    return choose(able, open_ones, {each.id: (each.id in taken | named, shunned[each.id]) for each in able}, hindered)
 
 
 Key = tuple[str, str]

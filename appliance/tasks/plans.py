@@ -1,6 +1,6 @@
 """Plans of the tasks that one gateway drives: made by the decomposer, checked, approved by a person, and revised."""
 
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Awaitable, Callable, Collection, Sequence
 
 from msgspec.structs import replace
 
@@ -9,7 +9,17 @@ from appliance.llm.cascade import Decomposer
 from appliance.llm.checks.safety import out_of_use
 from appliance.llm.checks.schema import validate
 from appliance.llm.settings import OutOfUse, PlanContext
-from appliance.model import Plan, Site, Subtask, SubtaskRecord, SubtaskState, TaskRecord, TaskRequest, TaskState
+from appliance.model import (
+    Plan,
+    RobotInfo,
+    Site,
+    Subtask,
+    SubtaskRecord,
+    SubtaskState,
+    TaskRecord,
+    TaskRequest,
+    TaskState,
+)
 from appliance.model.task_api import (
     ExperienceAsk,
     ExperienceList,
@@ -22,6 +32,7 @@ from appliance.model.task_api import (
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue
 from appliance.tasks.admission import checked
+from appliance.tasks.allocation import cost
 from appliance.tasks.machine import ACTIVE, plan_hash
 from appliance.tasks.replan import Robots, problems, remainder, splice
 from appliance.tasks.settings import TasksConfig
@@ -90,7 +101,7 @@ class Plans:
     def robots(self) -> Robots:
         """The roster as it is known now."""
         experience = self._decomposer.memory.experience
-        return Robots(roster=self._plane.registry.robots, busy=self._busy(), shuns=experience.shuns)
+        return Robots(roster=self._plane.registry.robots, busy=self._busy(), shuns=experience.shuns, short=self._short)
 
     async def plan(self, record: TaskRecord) -> Plan:
         """Return the plan handed in with the task if it is valid, else a new one."""
@@ -148,10 +159,23 @@ class Plans:
         doubts: tuple[str, ...] = ()
         if not record.handed_in:
             doubts = plan.provenance.confirm if plan.provenance is not None else ()
+            doubts = (*doubts, *self.below_reserve(plan))
         elif record.submitter in self._plane.registry.robots:
             context = self._context(record.instruction, submitter=record.submitter)
-            doubts = self._decomposer.review(plan, context).holds
+            doubts = (*self._decomposer.review(plan, context).holds, *self.below_reserve(plan))
         return "; ".join((*doubts, wanted) if wanted else doubts)
+
+    def below_reserve(self, plan: Plan) -> tuple[str, ...]:
+        """Which robots that a plan names would end below the reserve of their battery, in words."""
+        roster = self._plane.registry.robots
+        named = dict.fromkeys(name for each in plan.subtasks for name in each.robots if name in roster)
+        short = [self._short(roster[name], [each for each in plan.subtasks if name in each.robots]) for name in named]
+        return tuple(filter(None, short))
+
+    def _short(self, robot: RobotInfo, subtasks: Sequence[Subtask]) -> str:
+        """Why a robot would end below its reserve, in words; "" when it would not."""
+        expected = self._decomposer.memory.experience.expected_s
+        return cost(robot, subtasks, site=self._site, expected=expected, battery=self._config.battery).short
 
     def problems(self, record: TaskRecord | None, plan: Plan) -> tuple[str, ...]:
         """What is wrong with a plan just now; of a task that runs, with the continuation that it is."""

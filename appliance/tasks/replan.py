@@ -144,6 +144,8 @@ class Robots(Struct, frozen=True, kw_only=True):
     busy: Collection[str] = ()
     shuns: Callable[[str, str], str] = lambda _skill, _robot: ""
     """Skill, robot -> why the robot is chosen last for it, by experience; "" if nothing is against it."""
+    short: Callable[[RobotInfo, Sequence[Subtask]], str] = lambda _robot, _subtasks: ""
+    """Robot, subtasks -> why its charge does not do for them; "" if it does."""
 
 
 def robot_of(target: SubtaskRecord) -> str:
@@ -200,9 +202,10 @@ def another_robot(
         return f"the plan would have more than {MAX_SUBTASKS} subtasks"
     if unknown := [each.subtask.skill for each in (*rest, *again) if each.subtask.skill not in manifests]:
         return f"what {unknown[0]} needs of a robot is not known here"
-    wanted = [manifests[each.subtask.skill] for each in (*rest, *again)]
+    to_do = [each.subtask for each in (*again, *rest)]
+    wanted = [manifests[each.skill] for each in to_do]
     tried = {each.robot for one in rest for each in one.attempts if each.robot and each.failure}
-    chosen, reason = _choose(record, label, {old, *tried, *barred}, wanted, robots, config)
+    chosen, reason = _choose(record, label, {old, *tried, *barred}, wanted, to_do, robots)
     if chosen is None:
         return f"no other robot can take over: {reason}"
     plan = _with_copies(record, {each.subtask.id for each in roots}, [each.subtask for each in again])
@@ -260,8 +263,8 @@ def _choose(
     label: str,
     avoid: set[str],
     wanted: list[SkillManifest],
+    to_do: list[Subtask],
     robots: Robots,
-    config: ReplanConfig,
 ) -> tuple[RobotInfo | None, str]:
     reasons: list[str] = []
     fitting: list[RobotInfo] = []
@@ -269,11 +272,9 @@ def _choose(
         if robot.id in avoid:
             continue
         problem = "" if robot.online else f"{robot.id} is offline"
-        battery = robot.battery_percent
-        if not problem and battery is not None and battery < config.min_battery_percent:
-            problem = f"{robot.id} has {battery:.0f} % of its battery"
         if not problem and robot.holding:
             problem = f"{robot.id} holds {robot.holding}"
+        problem = problem or robots.short(robot, to_do)
         problem = problem or next((text for each in wanted if (text := able(robot, each))), "")
         if problem:
             reasons.append(problem)

@@ -7,21 +7,34 @@ and scores its members for each subtask; the fine level, the selection of a cont
 import hashlib
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 
 import structlog
 
 from appliance.background import Background
 from appliance.errors import NotFoundError, SwiftbotError
-from appliance.model import GatewayStatus, Group, Subtask, SubtaskRecord, TaskRecord, keyspace
+from appliance.model import (
+    GatewayStatus,
+    Group,
+    RobotInfo,
+    RobotWork,
+    Site,
+    Subtask,
+    SubtaskRecord,
+    TaskRecord,
+    keyspace,
+)
+from appliance.model.gateways import MOST_WORK
 from appliance.model.task_api import SkillList, SkillsAsk
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue
 from appliance.tasks import machine
+from appliance.tasks.allocation import Cost, Expected, choose, cost, seconds_of
 from appliance.tasks.orders import need_of
 from appliance.tasks.placement import (
     Asked,
+    Choose,
     Line,
     Place,
     Placement,
@@ -46,6 +59,8 @@ from appliance.tasks.settings import TasksConfig
 
 log = structlog.get_logger(__name__)
 
+COSTS_S = 1.0
+"""How long what a task would cost a robot is believed: a subtask that waits asks several times a second."""
 MOST_CATALOGUES = 256
 """Catalogues of other gateways that are remembered: mostly all have the same."""
 
@@ -63,6 +78,8 @@ class Scheduler:
         hindrance: why tasks may not command a robot just now; "" when they may.
         closed: why a subtask may not begin just now: the place that it goes to is closed; "" when it may.
         shuns: skill, robot -> why the robot is chosen last for it, by experience; "" if nothing is against it.
+        site: the map that ways are reckoned by; None: robots are chosen without their cost.
+        expected: skill, robot -> seconds that a run takes, by experience; None when nothing is known.
     """
 
     def __init__(
@@ -77,6 +94,8 @@ class Scheduler:
         hindrance: Callable[[str], str] = lambda _: "",
         closed: Callable[[Subtask], str] = lambda _: "",
         shuns: Callable[[str, str], str] = lambda _skill, _robot: "",
+        site: Site | None = None,
+        expected: Expected = lambda _skill, _robot: None,
     ) -> None:
         self._plane = plane
         self._catalogue = catalogue
@@ -86,6 +105,11 @@ class Scheduler:
         self._hindrance = hindrance
         self._closed = closed
         self._shuns = shuns
+        self._site = site
+        self._expected = expected
+        self._costs: dict[tuple[str, tuple[str, ...], str, float], Cost] = {}
+        """Task, subtasks, robot, work it has to do first -> what they would cost it, reckoned since `_costs_at`."""
+        self._costs_at = -math.inf
         self._looked: dict[str, float] = {}
         """Task -> when its group was last looked at as a whole."""
         self._skills: dict[str, frozenset[str]] = {}
@@ -115,6 +139,7 @@ class Scheduler:
         manifests = {
             each.subtask.id: skills[each.subtask.skill] for each in record.subtasks if each.subtask.skill in skills
         }
+        by_cost = self._choose_for(record, self._site) if self._site is not None else None
         choose = partial(
             candidates,
             records=record.subtasks,
@@ -125,8 +150,54 @@ class Scheduler:
             hindrance=self._hindrance,
             shuns=lambda each, robot: self._shuns(each.subtask.skill, robot),
             lost_ns=self._plane.registry.lost_ns,
+            choose=by_cost,
         )
         return bind(target.subtask.robots, choose)
+
+    def _choose_for(self, record: TaskRecord, site: Site) -> Choose:
+        """Return what chooses robots for a task by their cost, which is reckoned at most once in `COSTS_S`."""
+
+        def cost_of(robot: RobotInfo, subtasks: Sequence[Subtask], queue_s: float) -> Cost:
+            key = (record.id, tuple(each.id for each in subtasks), robot.id, queue_s)
+            if key not in self._costs:
+                self._costs[key] = cost(
+                    robot, subtasks, queue_s=queue_s, site=site, expected=self._expected, battery=self._config.battery
+                )
+            return self._costs[key]
+
+        def chosen(
+            robots: Sequence[RobotInfo],
+            subtasks: Sequence[Subtask],
+            behind: Mapping[str, tuple[bool, bool]],
+            hindered: Mapping[str, str],
+        ) -> tuple[list[str], str]:
+            if time.monotonic() - self._costs_at > COSTS_S:
+                self._costs.clear()
+                self._costs_at = time.monotonic()
+            waiting_s: dict[str, float] = {}
+            for each in self.fleet_work():
+                if each.task != record.id:
+                    waiting_s[each.robot] = waiting_s.get(each.robot, 0.0) + each.takes_s
+            return choose([cost_of(each, subtasks, waiting_s.get(each.id, 0.0)) for each in robots], behind, hindered)
+
+        return chosen
+
+    def work(self) -> tuple[RobotWork, ...]:
+        """Return what the tasks that this gateway coordinates have for robots."""
+        takes: dict[tuple[str, str], float] = {}
+        for record in self._records():
+            for each in record.subtasks:
+                for robot in each.robots:
+                    if robot in self._plane.registry.robots and not each.state.final and not record.state.final:
+                        key, takes_s = (robot, record.id), seconds_of(self._expected(each.subtask.skill, robot))
+                        takes[key] = takes.get(key, 0.0) + takes_s
+        found = (RobotWork(robot=robot, task=task, takes_s=round(takes_s)) for (robot, task), takes_s in takes.items())
+        return tuple(found)[:MOST_WORK]
+
+    def fleet_work(self) -> Iterable[RobotWork]:
+        """Return the same of the whole fleet, of each task once: while one changes hands two gateways tell it."""
+        found = {(each.robot, each.task): each for status in self.gateways().values() for each in status.work}
+        return (found | {(each.robot, each.task): each for each in self.work()}).values()
 
     def busy_robots(self) -> frozenset[str]:
         """Return the robots with a run in progress, as far as this gateway coordinates them."""

@@ -65,8 +65,6 @@ class ReplanConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     robot_wait_s: float = 15.0
     """How long a robot that went offline is waited for before another takes over: a link that blinks, or a gateway
     that restarts, is back within seconds."""
-    min_battery_percent: float = 20.0
-    """A robot that tells less does not stand in for another: it would be the next to fail."""
     skills: bool = True
     """Whether alternatives that manifests declare may be used."""
     decompose: bool = True
@@ -80,6 +78,20 @@ class ReplanConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """How long it waits; then the task fails."""
     ask_s: float = 90.0
     """How long the decomposer may take, all its tiers together."""
+
+
+class BatteryConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How much charge tasks leave a robot, and how much they are expected to use up."""
+
+    reserve_percent: Annotated[float, Meta(ge=0, le=95)] = 20.0
+    """No robot is chosen for a task that would leave it less, nor stands in for another, and a model's plan that would
+    is held for approval. A task that takes the robot to a charger may. 0: charge is not looked at."""
+    range_m: Positive = 5000.0
+    """How far a full battery takes a robot that does not tell its own `limits.range_m`, metres."""
+    lasts_s: Positive = 28_800.0
+    """How long a full battery lasts on the ground, moving or not: 8 hours, a shift."""
+    flies_s: Positive = 1200.0
+    """How long it lasts in the air: 20 minutes, as a usual copter's."""
 
 
 class DetectionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -166,6 +178,8 @@ class TasksConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     hand tasks in where nobody watches."""
     approval_s: Annotated[float, Meta(gt=0, le=604800)] = 600.0
     """How long a first plan waits to be approved; then the task fails: by later the site is another one."""
+    battery: BatteryConfig = field(default_factory=BatteryConfig)
+    """Charge that tasks leave robots."""
     detection: DetectionConfig = field(default_factory=DetectionConfig)
     """When a run is taken for stuck or straggling."""
     replan: ReplanConfig = field(default_factory=ReplanConfig)

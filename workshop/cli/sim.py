@@ -98,6 +98,7 @@ def zenoh(
     rate: float = 1.0,
     start: str = "charger",
     spot: int = 0,
+    battery: float = 100.0,
     where: Where = HERE,
 ) -> int:
     """Simulate a mobile robot with arm and camera that speaks Zenoh.
@@ -108,6 +109,7 @@ def zenoh(
         rate: How many times faster than real it moves.
         start: Place it starts at.
         spot: Which spot beside it, nearest first; 0 is the place itself.
+        battery: Its charge at first, %.
         where: The fleet.
     """
     from appliance.skills.sites import load_site
@@ -123,6 +125,7 @@ def zenoh(
         rate=rate,
         start=start,
         spot=spot,
+        battery_percent=battery,
     )
 
     async def go() -> None:

@@ -21,6 +21,7 @@ from msgspec import Struct, field
 from appliance.errors import ConfigError, ConflictError, UnreachableError
 from appliance.model import Notice, Pose, RobotCommand, RobotInfo, Site, encode, keyspace
 from appliance.model.keys import check_name
+from appliance.model.robots import plausible_battery
 from appliance.model.site import blocked_leg
 from appliance.plane.session import Session
 from appliance.plane.settings import PlaneConfig
@@ -91,6 +92,8 @@ class RobotSettings(Struct, frozen=True, kw_only=True):
         start_point(self.site, self.start, self.spot)
         if not (math.isfinite(self.rate) and 0.0 < self.rate <= 100.0):
             raise ConfigError(f"rate {self.rate:g}", remedy="use more than 0, at most 100")
+        if not plausible_battery(self.battery_percent):
+            raise ConfigError(f"a charge of {self.battery_percent:g} %", remedy="use 0 to 100")
 
 
 async def run_robot(settings: RobotSettings, *, stop: asyncio.Event | None = None) -> None:

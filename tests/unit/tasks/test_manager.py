@@ -20,8 +20,11 @@ from appliance.model import (
     Approval,
     Decision,
     GatewayStatus,
+    Place,
     Plan,
+    Pose,
     RobotInfo,
+    RobotWork,
     RunEvent,
     RunEventKind,
     Site,
@@ -46,6 +49,7 @@ from appliance.tasks.machine import Transition, TransitionKind
 from appliance.tasks.manager import TaskManager
 from appliance.tasks.plans import Plans
 from appliance.tasks.records import read_record, trimmed
+from appliance.tasks.scheduler import Scheduler
 from appliance.tasks.settings import TasksConfig
 
 pytestmark = pytest.mark.anyio
@@ -454,6 +458,53 @@ async def test_a_plan_that_a_robot_hands_in_waits_where_the_policy_says_so(manag
     assert plans.approval(replace(record, submitter="ann"), plan) == ""
     harmless = plane.plan_of(Subtask(id="s1", skill="hold", robot="rover_1"))
     assert plans.approval(replace(record, submitter="rover_1"), harmless) == ""
+
+
+async def test_robots_are_chosen_by_cost_and_a_plan_below_the_reserve_is_held(manager: TaskManager, plane: Any) -> None:
+    """By the gateway's map, roster and open tasks; a plan that a person handed in is not held."""
+    subtask = Subtask(id="s1", skill="goto", robot="any", params={"place": "shelf"})
+    site = Site(places={"shelf": Place(x=100.0, y=0.0)})
+    roster = plane.registry.robots
+    for name, x, percent in (("rover_1", 0.0, 90.0), ("rover_2", 90.0, 90.0), ("rover_3", 99.0, 20.0)):
+        roster[name] = RobotInfo(
+            id=name, kind="zenoh", uses=("base",), verbs=("goto", "state"), pose=Pose(x=x), battery_percent=percent
+        )
+    records: list[TaskRecord] = []
+    scheduler = Scheduler(
+        plane, load_catalogue(), TasksConfig(), records=lambda: records, wake=lambda _: None, image_of=lambda _: "",
+        site=site,
+    )  # fmt: skip
+    plan = plane.plan_of(subtask)
+    record = replace(plane.accepted(plan=plan), subtasks=(SubtaskRecord(subtask=subtask),))
+    robot, why = scheduler.bind(record, record.subtasks[0])
+    assert robot == ("rover_2",), why
+    assert "took rover_2" in why
+    assert "rover_3 would end with" in why
+    busy = tuple(SubtaskRecord(subtask=replace(subtask, id=f"s{n}"), bound_robot="rover_2") for n in range(60))
+    records.append(replace(record, id="t-2", subtasks=busy))
+    assert scheduler.bind(record, record.subtasks[0])[0] == ("rover_1",), "rover_2 has much to do first"
+    told = scheduler.work()
+    assert [(each.robot, each.task, each.takes_s) for each in told] == [("rover_2", "t-2", 180.0)]
+    records.clear()
+    gateway = GatewayStatus(id="gw-9", fleet="f", work=(RobotWork(robot="rover_2", task="t-3", takes_s=90.0),))
+    plane.registry.gateways["gw-9"] = gateway
+    assert scheduler.bind(record, record.subtasks[0])[0] == ("rover_2",), "a gateway that is gone does not count"
+    plane.present.add("gw-9")
+    assert scheduler.bind(record, record.subtasks[0])[0] == ("rover_1",), "work that another gateway coordinates counts"
+    plane.registry.gateways["gw-9"] = replace(gateway, work=(replace(gateway.work[0], task=record.id),))
+    assert scheduler.bind(record, record.subtasks[0])[0] == ("rover_2",), "the task's own work does not"
+    del plane.registry.gateways["gw-9"]
+    await scheduler.close()
+
+    catalogue = load_catalogue()
+    plans = Plans(
+        TasksConfig(), plane, catalogue=catalogue, decomposer=Decomposer(LlmConfig(tiers=("rules",)), catalogue),
+        site=site, task=manager.questions.task, busy=tuple,
+    )  # fmt: skip
+    low = plane.plan_of(replace(subtask, robot="rover_3"))
+    assert "rover_3 would end with 19." in plans.approval(plane.accepted(), low)
+    assert plans.approval(plane.accepted(), plane.plan_of(replace(subtask, robot="rover_2"))) == ""
+    assert plans.approval(replace(plane.accepted(plan=low), submitter="ann"), low) == ""
 
 
 async def test_fields_of_a_newer_version_stay_whatever_is_done_with_a_task(manager: TaskManager, plane: Any) -> None:

@@ -119,7 +119,7 @@ def test_the_operators_wish_decides_which_robots_may_be_replaced(label: str, pol
     ("other", "reason"),
     [
         ({"online": False}, "is offline"),
-        ({"battery_percent": 12.0}, "12 % of its battery"),
+        ({"battery_percent": 12.0}, "has too little charge"),
         ({"holding": "red box"}, "holds red box"),
         ({"uses": ("base",)}, "has no camera"),
         ({"verbs": ("goto", "state")}, "does not know"),
@@ -127,7 +127,8 @@ def test_the_operators_wish_decides_which_robots_may_be_replaced(label: str, pol
 )
 def test_a_robot_that_cannot_take_over_is_not_chosen_and_the_reason_is_told(other: Any, reason: str) -> None:
     """Offline, nearly empty, with its gripper full, without the camera or the command."""
-    robots = Robots(roster={**ROBOTS.roster, "rover_2": rover("rover_2", **other)})
+    roster = {**ROBOTS.roster, "rover_2": rover("rover_2", **other)}
+    robots = Robots(roster=roster, short=lambda robot, _: "has too little charge" if robot.battery_percent else "")
     found = rebind(given_up((GOTO, PHOTO), "s2", OFFLINE), "s2", robots=robots)
     assert isinstance(found, str)
     assert reason in found
