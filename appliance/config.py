@@ -110,6 +110,7 @@ def check(config: GatewayConfig, source: str) -> None:
             for link in config.robots.mavlink:
                 link.check_keyed()
         config.floor.check()
+        config.tasks.battery.check(reserved=bool(config.plane.voters) and config.floor.enabled)
         config.record.check()
         config.llm.check()
         config.safety.check()

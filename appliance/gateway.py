@@ -27,6 +27,7 @@ from msgspec.structs import replace
 from appliance import logs, process
 from appliance.alerts import Keeper
 from appliance.alerts.keeper import disk_mb
+from appliance.charging.keeper import Charging
 from appliance.closures import keeper as closures
 from appliance.closures.keeper import Closures
 from appliance.config import GatewayConfig
@@ -412,7 +413,7 @@ class Gateway:
         )
         self.migration.start()
         self._stack.push_async_callback(self.migration.close)
-        self._take_tasks(audit)
+        self._take_tasks(audit, site)
         self._retention = await self._start_learning(artifacts, audit)
         self._publish_status()
         root_tasks = {
@@ -468,8 +469,8 @@ class Gateway:
             tasks=Counter(map(task_status, self.manager.records)),
         )
 
-    def _take_tasks(self, audit: Audit) -> None:
-        """Take tasks from robots, and from the schedules that are this gateway's."""
+    def _take_tasks(self, audit: Audit, site: Site) -> None:
+        """Take tasks from robots, from the schedules that are this gateway's, and for robots that have to charge."""
         self._robot_tasks.open(self.manager.submit, self.manager.questions)
         self._stack.callback(self._robot_tasks.close)
         schedules = ScheduleManager(
@@ -481,6 +482,19 @@ class Gateway:
         )
         schedules.start(audit)
         self._stack.push_async_callback(schedules.stop)
+        charging = Charging(
+            self.plane,
+            site,
+            self.config.tasks.battery,
+            floor=self.floor,
+            work=self.manager.scheduler.fleet_work,
+            hindrance=self.authority.hindrance,
+            closed=lambda: self.closures.places,
+            submit=audit.submission(self.manager.submit),
+            task=self.manager.questions.task,
+        )
+        charging.start()
+        self._stack.push_async_callback(charging.stop)
 
     def _learning_folder(self) -> Path:
         """Where this gateway's data sets and people's own models are."""

@@ -111,6 +111,15 @@ class Site(Struct, frozen=True, kw_only=True, omit_defaults=True):
         things = (*self.objects, *self.doors, *self.devices, *self.people)
         return (*places, *(each.name for each in things))
 
+    @property
+    def chargers(self) -> dict[str, Place]:
+        """The places where robots charge: by a word of their name or aliases."""
+        return {
+            name: place
+            for name, place in self.places.items()
+            if any("charg" in each.casefold() for each in (name, *place.aliases))
+        }
+
     def find(self, name: str) -> Place | None:
         """Return the place of that name or alias (case and articles ignored), or None."""
         wanted = " ".join(word for word in name.lower().replace("_", " ").split() if word not in ("the", "a", "an"))

@@ -13,7 +13,8 @@ import msgspec
 from msgspec import Struct
 
 from appliance.estimate import estimate
-from appliance.model import Place, Plan, RobotInfo, Site, Subtask
+from appliance.floor.decide import PLACE_M
+from appliance.model import Plan, RobotInfo, Site, Subtask
 from appliance.tasks.settings import BatteryConfig
 
 MOST_TOLD = 4
@@ -38,6 +39,8 @@ class Cost(Struct, frozen=True, kw_only=True):
     """Charge at the end; None: not known."""
     short: str = ""
     """Why it must not be taken: it would end below its reserve. In words; empty when it would not."""
+    charging: str = ""
+    """Why it is not chosen: it stands at a charger, and has not charged enough. In words; empty when that is not so."""
     holding: str = ""
     """What it carries now."""
     unsuited: bool = False
@@ -101,9 +104,11 @@ def cost(
         left = max(0.0, math.floor(10 * ends) / 10)
         reserve = f"{battery.reserve_percent:g} %"
         short = f"{robot.id} would end with {left:g} % of its battery, below the reserve of {reserve}"
+    at = "" if charges else _charges_at(robot, site, battery)
+    charging = f"{robot.id} charges at {at}, until it has {battery.charged_percent:g} %" if at else ""
     return Cost(
         robot=robot.id, queue_s=queue_s, takes_s=takes_s, way_m=way_m, ends_percent=ends, short=short,
-        holding=robot.holding, unsuited=bool(robot.holding) != _puts(mine),
+        charging=charging, holding=robot.holding, unsuited=bool(robot.holding) != _puts(mine),
     )  # fmt: skip
 
 
@@ -128,7 +133,7 @@ def best_first(costs: Sequence[Cost], *, last: Callable[[str], tuple[bool, bool]
         costs: of the robots that can do it.
         last: what counts before all of that; smaller comes first.
     """
-    free = [each for each in costs if not each.short]
+    free = [each for each in costs if not each.short and not each.charging]
     return sorted(
         free,
         key=lambda each: (
@@ -148,13 +153,22 @@ def choose(
         hindered: robots that tasks may not command just now, with the reason.
     """
     order = best_first(costs, last=lambda robot: behind[robot])
-    short = sorted(each.short for each in costs if each.short)
+    short = sorted(each.short or each.charging for each in costs if each.short or each.charging)
     if not order:
         return [], f"waits for a robot: {'; '.join(short)}"
     told = [f"took {order[0]}"]
     told += [f"not {each}{', keeps failing at it' if behind[each.robot][1] else ''}" for each in order[1:MOST_TOLD]]
     told += [*short, *(f"{name} is {reason}" for name, reason in sorted(hindered.items()))]
     return [each.robot for each in order], "; ".join(told)
+
+
+def _charges_at(robot: RobotInfo, site: Site, battery: BatteryConfig) -> str:
+    """Return the charger at which a robot has to stay; "" when it need not."""
+    pose, percent = robot.pose, robot.battery_percent
+    if not battery.auto_charge or pose is None or percent is None or percent >= battery.charged_percent:
+        return ""
+    near = (name for name, place in site.chargers.items() if math.dist((place.x, place.y), (pose.x, pose.y)) <= PLACE_M)
+    return next(near, "")
 
 
 def seconds_of(known: float | None) -> float:
@@ -168,14 +182,8 @@ def _puts(subtasks: Sequence[Subtask]) -> bool:
     return bool(skills & {"place", "give"}) and "pick" not in skills
 
 
-def is_charger(name: str, place: Place) -> bool:
-    """Whether robots charge at a place: by a word of its name or aliases."""
-    return any("charg" in each.casefold() for each in (name, *place.aliases))
-
-
 def goes_to_charger(subtask: Subtask, site: Site) -> bool:
     """Whether a subtask takes its robot to a charger."""
     docks = subtask.skill == "dock"
     named = subtask.params.get("station", USUAL_STATION) if docks else subtask.params.get("place", "")
-    place = site.find(str(named))
-    return place is not None and any(is_charger(name, each) for name, each in site.places.items() if each is place)
+    return site.find(str(named)) in site.chargers.values()

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
 
+from appliance.errors import ConfigError
 from appliance.model import Approval
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -92,6 +93,25 @@ class BatteryConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """How long a full battery lasts on the ground, moving or not: 8 hours, a shift."""
     flies_s: Positive = 1200.0
     """How long it lasts in the air: 20 minutes, as a usual copter's."""
+    auto_charge: bool = False
+    """Whether a robot on the ground that has nothing to do and less than its reserve goes to a free charger by itself,
+    a place with `charg` in its name or aliases. Needs `plane.voters`, which grant ways and chargers."""
+    charged_percent: Annotated[float, Meta(gt=0, le=100)] = 80.0
+    """With `auto_charge`: a robot that stands at a charger is chosen for tasks again from this charge on, and makes
+    room there for one that waits."""
+
+    def check(self, *, reserved: bool) -> None:
+        """Check what types cannot tell; ConfigError. `reserved`: whether the floor is."""
+        if self.auto_charge and not reserved:
+            raise ConfigError(
+                "tasks.battery.auto_charge is on, and ways and places are not reserved",
+                remedy="name the gateways that grant ways in plane.voters, and leave floor.enabled on",
+            )
+        if self.auto_charge and not 0 < self.reserve_percent < self.charged_percent:
+            raise ConfigError(
+                f"tasks.battery: a reserve of {self.reserve_percent:g} %, charged at {self.charged_percent:g} %",
+                remedy="with auto_charge the reserve must be more than 0 and less than charged_percent",
+            )
 
 
 class DetectionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

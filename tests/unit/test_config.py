@@ -13,6 +13,7 @@ from appliance.model.robot_api import MavlinkLink
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.settings import PoolConfig
 from appliance.robots.settings import RobotsConfig
+from appliance.tasks.settings import BatteryConfig, TasksConfig
 
 
 def write(path: Path, text: str) -> Path:
@@ -110,3 +111,22 @@ def test_with_keys_mavlink_links_that_others_reach_are_signed(tmp_path: Path) ->
     with pytest.raises(ConfigError, match=r"udp://0.0.0.0:14550 is not signed"):
         config.load(write(tmp_path / "g.toml", f'id = "gw-1"\n{keys}{robots}'))
     config.load(write(tmp_path / "g.toml", f'id = "gw-1"\n{robots}'))
+
+
+@pytest.mark.parametrize(
+    ("battery", "voters", "problem"),
+    [
+        (BatteryConfig(auto_charge=True), (), "not reserved"),
+        (BatteryConfig(auto_charge=True, reserve_percent=0.0), ("gw-1",), "a reserve of 0 %"),
+        (BatteryConfig(auto_charge=True, charged_percent=20.0), ("gw-1",), "charged at 20 %"),
+    ],
+)
+def test_robots_charge_by_themselves_only_where_the_floor_is_reserved(
+    battery: BatteryConfig, voters: tuple[str, ...], problem: str
+) -> None:
+    """And from a reserve up to a charge above it; with voters and the usual figures all is well."""
+    made = GatewayConfig(id="gw-1", plane=PlaneConfig(voters=voters), tasks=TasksConfig(battery=battery))
+    with pytest.raises(ConfigError, match=problem):
+        config.check(made, "gateway.toml")
+    tasks = TasksConfig(battery=BatteryConfig(auto_charge=True))
+    config.check(GatewayConfig(id="gw-1", plane=PlaneConfig(voters=("gw-1",)), tasks=tasks), "gateway.toml")

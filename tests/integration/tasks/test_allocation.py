@@ -2,7 +2,8 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
@@ -13,29 +14,41 @@ from appliance.client import FleetClient
 from appliance.llm.settings import SafetyConfig
 from appliance.model import TaskRequest, TaskState
 from appliance.pool.settings import PoolConfig
+from appliance.tasks.settings import BatteryConfig, TasksConfig
+from tests.integration.tasks.test_floor import RADIUS_M, Distances
 from tests.integration.tasks.test_partition import process
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
 LONG_S = 90.0
-ROVERS = {"rover_1": ("dock 2", "15"), "rover_2": ("charger", "90")}
-"""Where they stand at first, and their charge."""
+BATTERY = BatteryConfig(auto_charge=True, reserve_percent=20.0, charged_percent=40.0)
+
+
+@asynccontextmanager
+async def rovers(
+    folder: Path, *, rate: int, battery: BatteryConfig, **of: tuple[str, int]
+) -> AsyncGenerator[FleetClient]:
+    """Two gateways that choose robots by themselves; `of`: where each rover stands at first, and its charge."""
+    base = replace(PLAIN, safety=SafetyConfig(choose_robot="auto"), tasks=TasksConfig(battery=battery))
+    async with contextlib.AsyncExitStack() as stack:
+        fleet = await stack.enter_async_context(
+            fleet_in(folder, gateways=2, zenoh=0, pool=PoolConfig(floor={"base": 2}), base=base)
+        )
+        for name, (start, percent) in of.items():
+            where = ("--fleet", fleet.fleet, "--connect", fleet.endpoints[0])
+            rover = ("--name", name, "--start", start, "--battery", str(percent), "--rate", str(rate))
+            await stack.enter_async_context(process(folder, name, "sim", "zenoh", *rover, *where))
+        client = await stack.enter_async_context(FleetClient(fleet.endpoint, operator="ann"))
+        async with asyncio.timeout(LONG_S):
+            while set(client.plane.registry.robots) != set(of):
+                await asyncio.sleep(0.1)
+        yield client
 
 
 @pytest.fixture
 async def client(tmp_path: Path) -> AsyncIterator[FleetClient]:
-    """Two gateways; one rover with little charge near dock 1, the other far away."""
-    base = replace(PLAIN, safety=SafetyConfig(choose_robot="auto"))
-    order = {"gateways": 2, "zenoh": 0, "pool": PoolConfig(floor={"base": 2}), "base": base}
-    async with contextlib.AsyncExitStack() as stack:
-        fleet = await stack.enter_async_context(fleet_in(tmp_path, **order))
-        for name, (start, battery) in ROVERS.items():
-            where = ("--fleet", fleet.fleet, "--connect", fleet.endpoints[0])
-            rover = ("--name", name, "--start", start, "--battery", battery, "--rate", "4")
-            await stack.enter_async_context(process(tmp_path, name, "sim", "zenoh", *rover, *where))
-        client = await stack.enter_async_context(FleetClient(fleet.endpoint, operator="ann"))
-        async with asyncio.timeout(LONG_S):
-            while set(client.plane.registry.robots) != set(ROVERS):
-                await asyncio.sleep(0.1)
+    """One rover with little charge near dock 1, the other far away."""
+    where = {"rover_1": ("dock 2", 15), "rover_2": ("charger", 90)}
+    async with rovers(tmp_path, rate=4, battery=BatteryConfig(), **where) as client:
         yield client
 
 
@@ -67,3 +80,20 @@ async def test_the_nearer_robot_with_low_charge_is_not_taken(client: FleetClient
     assert proposal.waits
     assert low in proposal.note
     await client.cancel("t-named")
+
+
+async def test_robots_charge_by_themselves_one_after_the_other(tmp_path: Path) -> None:
+    """The first makes room when it has charged enough and the other waits: by tasks that everybody sees."""
+    places = {"rover_1": ("dock 2", 16), "rover_2": ("dock 4", 12)}
+    async with rovers(tmp_path, rate=20, battery=BATTERY, **places) as client:
+        seen, robots = Distances(client), client.plane.registry.robots
+        async with asyncio.timeout(LONG_S):
+            while not all((robots[each].battery_percent or 0.0) > BATTERY.reserve_percent for each in places):
+                await asyncio.sleep(0.2)
+        tasks = sorted((await client.tasks(50)).tasks, key=lambda each: each.created_ns)
+        by_itself = [each.id.rsplit("-", 1)[0] for each in tasks if each.submitter == "swiftbot"]
+        first = by_itself[0].removeprefix("charge-")
+        (other,) = places.keys() - {first}
+        assert by_itself[:3] == [f"charge-{first}", f"leave-{first}", f"charge-{other}"]
+        assert seen.least >= 2 * RADIUS_M
+        seen.close()

@@ -101,6 +101,23 @@ def test_a_way_to_the_charger_may_use_the_reserve() -> None:
     assert "below the reserve" in reckon(low, replace(go(), params={})).short
 
 
+def test_a_robot_that_charges_is_taken_when_it_has_charged_enough() -> None:
+    """With `auto_charge`: one at a charger is passed over up to that charge; it may be sent to charge on."""
+    battery = replace(BATTERY, auto_charge=True, charged_percent=80.0)
+
+    def why(robot: RobotInfo, subtask: Subtask, battery: BatteryConfig = battery) -> str:
+        return cost(robot, [subtask], site=SITE, expected=lambda _skill, _robot: None, battery=battery).charging
+
+    robot = replace(ROVER, pose=Pose(x=100.5, y=5.0), battery_percent=79.0)
+    assert why(robot, go()) == "rover_1 charges at charger 1, until it has 80 %"
+    assert why(robot, go("charger 1")) == ""
+    assert why(robot, go(), BATTERY) == ""
+    assert why(replace(robot, battery_percent=80.0), go()) == ""
+    assert why(replace(robot, pose=Pose(x=102.0, y=5.0)), go()) == ""
+    costs = [cost(robot, [go()], site=SITE, expected=lambda _skill, _robot: None, battery=battery)]
+    assert choose(costs, {}, {}) == ([], "waits for a robot: rover_1 charges at charger 1, until it has 80 %")
+
+
 def test_a_battery_that_is_not_told_is_not_judged() -> None:
     """Nor one while the reserve is 0."""
     assert reckon(replace(ROVER, battery_percent=None), go()).short == ""
