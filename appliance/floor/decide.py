@@ -109,6 +109,10 @@ class Trip(Struct, frozen=True, kw_only=True):
     flies: bool = False
     fixed: bool = False
     """Whether the robot follows just these points: they cannot be changed."""
+    reach_m: float = 0.0
+    """It has no goal: what it can reach around it is reserved, again and again."""
+    beside: str = ""
+    """The robot that it follows."""
     ticket: int = 0
 
 
@@ -189,6 +193,8 @@ class Floor:
         """
         me = bodies[trip.robot]
         others = [each for each in bodies.values() if each.robot != trip.robot and _meet(me, trip, each)]
+        if trip.reach_m:
+            return self._roam(trip, me, others)
         place, goal = "", trip.points[-1]
         if not trip.fixed:
             found = self.place_at(goal, trip)
@@ -231,6 +237,26 @@ class Floor:
             # It is not in the way: nobody has to give way for that.
             return Wait(robot="", why=f"waits for {first}, which has waited longer", place=place, way=way)
         return step
+
+    def _roam(self, trip: Trip, me: Body, others: Sequence[Body]) -> Go | Wait:
+        """Return what a robot without a goal can reach, but for where others stand and the one that it follows is.
+
+        Of those it keeps clear by its own sensors, and it is stopped before it comes too near to one that stands.
+        """
+        target = next((each for each in others if each.robot == trip.beside), None)
+        if target is not None:
+            between = (me.at, target.at)
+            for each in others:
+                if each is not target and not each.moved and not _clear(between, each, me):
+                    return Wait(robot=each.robot, why=_moves(each), way=between)
+        reached = replace(me.size, radius_m=me.size.radius_m + trip.reach_m)
+        parts = geometry.cells((me.at,), reached)
+        for each in others:
+            if each is target:
+                parts -= geometry.cells((each.at, *each.bound), each.size)
+            elif each.stands:
+                parts -= geometry.cells((each.at,), each.size)
+        return Go(way=(me.at,), parts=parts | geometry.cells((me.at,), me.size))
 
     # --- stretches --------------------------------------------------------------------------------------------
 

@@ -21,8 +21,8 @@ from appliance.floor.decisions import NAME, Refusal, WayCase, begun, decided, ma
 from appliance.floor.mover import Mover
 from appliance.floor.settings import FloorConfig
 from appliance.floor.sight import Sight
-from appliance.floor.trips import goto_args, trip_of
-from appliance.model import RobotCommand, RobotReply, Site, encode, keyspace
+from appliance.floor.trips import follow_mps, goto_args, trip_of
+from appliance.model import RobotCommand, RobotInfo, RobotReply, Site, encode, keyspace
 from appliance.model.floor import FloorState, Point
 from appliance.model.plane_api import MOST_PARTS
 from appliance.plane.leases import Claim, GrantCase, Lease
@@ -46,6 +46,8 @@ STOP_S = 15.0
 """How long a robot may take to stand once it was stopped."""
 AT_M = 0.15
 """A robot that is seen so near to the end of a stretch has arrived there."""
+_LEAST_S = 0.1
+"""What is left to follow at least."""
 _LAST_S = 1.5
 """A robot is stopped so long before its reservation ends."""
 
@@ -236,6 +238,10 @@ class FloorKeeper:
         """Return why a robot may not be commanded just now; "" when it may."""
         return self._hindrance(robot)
 
+    def info(self, robot: str) -> RobotInfo | None:
+        """Return what a robot says of itself."""
+        return self._plane.registry.robots.get(robot)
+
     @property
     def wait_s(self) -> float:
         """How long a command waits at most."""
@@ -307,6 +313,7 @@ class _Drive:
         self._joins: str | None = None
         """Id of the command that its robot was on already."""
         self._waited_s = 0.0
+        self._followed_s = 0.0
         self._noted, self._noted_at = "", 0.0
 
     async def run(self) -> RobotReply:
@@ -368,7 +375,7 @@ class _Drive:
             return Wait(robot="", why=f"waits for {robot}: it does {other.trip.command}")
         if body.moved and body.state is not None and not self._same(body.state):
             return Wait(robot="", why=f"waits for {robot}: it does {body.state.command}")
-        if self._command.attempt > 1 and not self._begun and not body.stands:
+        if self._command.attempt > 1 and not self._begun and not self._joins and not body.stands:
             return Wait(robot="", why=f"waits for {robot} to stand still")
         return None
 
@@ -415,9 +422,13 @@ class _Drive:
             return None
         floor, body = self._keeper.floor, self._body()
         state = body.state
-        if state is None or not self._same(state) or len(state.way) < 2:
+        if state is None or not self._same(state) or not state.way:
             return None
         joins = body.moved and not body.stands
+        if self._trip.reach_m and joins:
+            self._joins = state.command  # it is joined once what it can reach is reserved anew
+        if len(state.way) < 2:
+            return None
         if state.wants and not self._trip.fixed and (joins or math.dist(body.at, state.way[-1]) <= PLACE_M):
             self._mover.goes_on(state.wants)
         if not joins:
@@ -448,6 +459,8 @@ class _Drive:
     def _next(self, go: Go) -> RobotCommand:
         """Return the command for a way; one that does not end where the command ends has an id of its own."""
         command, joins = self._command, self._joins
+        if command.verb in ("push", "follow"):
+            return self._once_more(command, joins or "")
         if self._trip.fixed:
             return command
         args = goto_args(command, self._trip, go.way)
@@ -466,10 +479,21 @@ class _Drive:
             return replace(goto, id=f"{command.id}~h{self._sent}")
         return goto if self._sent == 1 else replace(goto, id=f"{command.id}~{self._sent}")
 
+    def _once_more(self, command: RobotCommand, joins: str) -> RobotCommand:
+        """Return a command that begins anew where the robot stands when it was stopped before its end."""
+        self._joins, self._sent = "", self._sent + 1
+        name = joins or (command.id if self._sent == 1 else f"{command.id}~{self._sent}")
+        info = self._keeper.info(self._robot)
+        if command.verb == "push" or info is None:
+            return replace(command, id=name)
+        left = max(_LEAST_S, float(command.args["duration_s"]) - self._followed_s)
+        speed = follow_mps(command.args.get("speed_mps"), info)
+        return replace(command, id=name, args=command.args | {"duration_s": left, "speed_mps": speed})
+
     async def _go(self, go: Go) -> RobotReply | None:
         """Go a way that is reserved; None: it was stopped, or the way was not the whole one."""
         keeper, mover = self._keeper, self._mover
-        command = self._next(go)
+        command, began = self._next(go), time.monotonic()
         mover.started(go)
         keeper.tell(mover, command.id)
         sending = asyncio.ensure_future(self._send(command))
@@ -497,6 +521,7 @@ class _Drive:
             await self._stand()
             return None
         finally:
+            self._followed_s += time.monotonic() - began
             sending.cancel()
             keeping.cancel()
             await asyncio.gather(sending, keeping, return_exceptions=True)
@@ -527,6 +552,10 @@ class _Drive:
             lease, body = self._lease, self._body()
             if lease is None or self._mover.go is None:
                 continue
+            if self._trip.reach_m:
+                if why := await self._keep_around(lease):
+                    return why
+                continue
             try:
                 claim = await self._keeper.claim(self._robot, self._mover.parts(body), after=lease.fence)
             except SwiftbotError as error:
@@ -540,3 +569,24 @@ class _Drive:
                 self._lease = None
             elif lease.left_s <= _LAST_S:
                 return f"{claim.holder}, which has its way"
+
+    async def _keep_around(self, lease: Lease) -> str:
+        """Reserve what a robot without a goal can reach now; returns why it must stop, "" when it need not.
+
+        It is stopped at once: what was reserved before is what it can reach until it stands.
+        """
+        keeper, mover = self._keeper, self._mover
+        step = keeper.floor.decide(mover.trip, keeper.bodies())
+        if isinstance(step, Wait):
+            return step.why.removeprefix("waits for ")
+        try:
+            claim = await keeper.claim(self._robot, step.parts, after=lease.fence)
+            if claim.lease is not None:  # it has what it had as well: that is given up by the next
+                mover.go, self._lease = step, claim.lease
+                claim = await keeper.claim(self._robot, step.parts, after=claim.lease.fence)
+        except SwiftbotError as error:
+            return f"the gateways that grant ways: {error.message}"
+        if claim.lease is None:
+            return f"{claim.holder}, which has its way"
+        self._lease = claim.lease
+        return ""

@@ -1,5 +1,6 @@
 """What one command does next on the floor: ask for a way, wait, give way. Pure; `keeper` carries it out."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +14,7 @@ BEHIND_M = 0.3
 """How much of the way behind a robot stays reserved."""
 LOOK_S, LOOK_M = 1.5, 0.5
 """A robot looks so far ahead for what has no reservation."""
+_STILL_M = 0.02
 DETOUR_S = 4.0
 """How often a robot that waits for others to pass looks for a way round them."""
 
@@ -33,6 +35,7 @@ class Mover:
         self._leg = 0
         self.since: float | None = None
         """When it began to wait."""
+        self._before: Point | None = None
         self._avoid: tuple[str, ...] = ()
         self.looked = -DETOUR_S
         """When it looked for a way round others last."""
@@ -127,10 +130,23 @@ class Mover:
 
     def threat(self, body: Body, bodies: Mapping[str, Body]) -> Body | None:
         """Return a robot that it would come too near to if it went on."""
+        if self.trip.reach_m:
+            return self._ahead(body, bodies)
         left = self.rest(body.at)
         start = (body.at, *left[1:]) if len(left) > 1 else (body.at,)
         stretch = geometry.ahead(start, LOOK_M + LOOK_S * body.speed_mps)
         return threat(stretch, body, bodies.values())
+
+    def _ahead(self, body: Body, bodies: Mapping[str, Body]) -> Body | None:
+        """Return a robot that one without a goal would come too near to if it went on as it does."""
+        before, self._before = self._before, body.at
+        gone = math.dist(before, body.at) if before is not None else 0.0
+        if before is None or gone < _STILL_M:
+            return None
+        look = (LOOK_M + LOOK_S * body.speed_mps) / gone
+        x, y, z = (here + look * (here - there) for here, there in zip(body.at, before, strict=True))
+        others = (each for each in bodies.values() if each.robot != self.trip.beside)
+        return threat((body.at, (x, y, z)), body, others)
 
     def state(self, gateway: str, command: str, now: float) -> FloorState:
         """Return what others are told."""

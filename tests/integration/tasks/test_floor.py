@@ -20,7 +20,7 @@ from relays import Relay, router
 from appliance import config as configuration
 from appliance.client import Endpoint, FleetClient
 from appliance.connection import FleetState
-from appliance.model import RobotInfo, TaskRequest, TaskState, keyspace
+from appliance.model import Plan, RobotInfo, Subtask, TaskRequest, TaskState, keyspace
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import remove_fleet
 from appliance.pool.settings import PoolConfig
@@ -148,6 +148,28 @@ async def test_a_gateway_dies_meanwhile(fleet: FleetState) -> None:
         assert set(states.values()) == {TaskState.SUCCEEDED}, states
         assert seen.least >= 2 * RADIUS_M, time.monotonic() - began
         seen.close()
+
+
+@pytest.mark.long
+async def test_a_rover_follows_another_past_a_third(tmp_path: Path) -> None:
+    """It keeps up, never comes too near to either, and its time is over when it was asked to be."""
+    async with fleet_in(tmp_path, gateways=3, zenoh=3, pool=PoolConfig(floor={"base": 2}), base=PLAIN) as state:
+        async with FleetClient(state.endpoint, operator="ann") as client:
+            seen = Distances(client)
+            follow = Subtask(id="s1", skill="follow", robot="rover_2", params={"target": "rover_1", "duration_s": 12.0})
+            lead = Subtask(
+                id="s1", skill="goto", robot="rover_1", params={"place": "inspection point", "speed_mps": 1.0}
+            )
+            for name, subtask in (("t-lead", lead), ("t-follow", follow)):
+                plan = Plan(domain="navigation", subtasks=(subtask,))
+                await client.submit(TaskRequest(instruction="try", id=name, plan=plan))
+            states = await until_ended(client, "t-lead", "t-follow")
+            assert set(states.values()) == {TaskState.SUCCEEDED}, states
+            assert seen.least >= 2 * RADIUS_M
+            assert 2 * RADIUS_M < math.dist(seen.at["rover_1"], seen.at["rover_2"]) < 5.0
+            seen.close()
+        report = check(sorted(Path(state.record_dir).glob("*.mcap")))
+        assert report.same, report.divergences
 
 
 @asynccontextmanager
