@@ -265,14 +265,14 @@ class Floor:
         me = bodies[trip.robot]
         others = [each for each in bodies.values() if each.robot != trip.robot and _meet(me, trip, each)]
         ends = [end for end, cells in go.sweep if part in cells]
-        if trip.flies or trip.fixed or go.yields or not ends:
+        if trip.fixed or go.yields or not ends:
             return None
         spots = [each for each in self._stops(go, me, others) if each < ends[0]]
         return _cut(go, spots[-1], me.size) if spots else None
 
     def _stretch(self, go: Go, trip: Trip, me: Body, others: Sequence[Body]) -> Go:
         """Return what of a way is reserved at first: all of it where no other wants to pass."""
-        if trip.flies or trip.fixed or geometry.length(go.way) <= STRETCH_M:
+        if trip.fixed or geometry.length(go.way) <= STRETCH_M:
             return go
         near = [
             wanted
@@ -290,7 +290,11 @@ class Floor:
         last = geometry.length(go.way) - SHORTEST_M
         found: list[float] = []
         for end, _ in go.sweep:
-            if SHORTEST_M <= end <= last and self._clear_of_others(geometry.ahead(go.way, end)[-1][:2], me, others):
+            if not SHORTEST_M <= end <= last:
+                continue
+            spot = geometry.ahead(go.way, end)[-1][:2]
+            # A drone does not stop above where it takes off.
+            if math.dist(spot, me.at[:2]) >= SHORTEST_M and self._clear_of_others(spot, me, others):
                 found.append(end)
         return found
 

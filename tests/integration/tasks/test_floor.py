@@ -12,6 +12,7 @@ from functools import partial
 from itertools import combinations
 from pathlib import Path
 
+import msgspec
 import pytest
 from fleets import PLAIN, fleet_in
 from msgspec.structs import replace
@@ -20,11 +21,13 @@ from relays import Relay, router
 from appliance import config as configuration
 from appliance.client import Endpoint, FleetClient
 from appliance.connection import FleetState
+from appliance.floor.decisions import WayCase
 from appliance.model import Plan, RobotInfo, Subtask, TaskRequest, TaskState, keyspace
 from appliance.plane.settings import PlaneConfig
 from appliance.pool.engine import remove_fleet
 from appliance.pool.settings import PoolConfig
 from appliance.ports import free_port
+from appliance.record.reader import read
 from appliance.tasks.replay import check
 from appliance.tasks.settings import MigrationConfig, TasksConfig
 from tests.integration.tasks.test_partition import LEASE_MS, process, until_seen
@@ -32,6 +35,7 @@ from tests.integration.tasks.test_partition import LEASE_MS, process, until_seen
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
 RADIUS_M = 0.4
 """Of a rover that says nothing of its size."""
+DRONE_M = 0.5
 LONG_S = 90.0
 
 
@@ -170,6 +174,35 @@ async def test_a_rover_follows_another_past_a_third(tmp_path: Path) -> None:
             seen.close()
         report = check(sorted(Path(state.record_dir).glob("*.mcap")))
         assert report.same, report.divergences
+
+
+@pytest.mark.long
+async def test_two_drones_cross(tmp_path: Path) -> None:
+    """Who comes second flies up to the other's way, hovers, and goes on when it has passed: by stretches."""
+    pool = PoolConfig(floor={"base": 2})
+
+    async def fly(client: FleetClient, **goals: str) -> None:
+        for drone, goal in goals.items():
+            goto = Subtask(id="s1", skill="goto", robot=drone, params={"place": goal, "speed_mps": 4.0})
+            plan = Plan(domain="navigation", subtasks=(goto,))
+            await client.submit(TaskRequest(instruction="try", id=f"t-{drone}-{goal[1]}", plan=plan))
+        states = await until_ended(client, *(f"t-{drone}-{goal[1]}" for drone, goal in goals.items()))
+        assert set(states.values()) == {TaskState.SUCCEEDED}, states
+
+    async with fleet_in(tmp_path, gateways=3, zenoh=0, mavlink=2, pool=pool, base=PLAIN) as state:
+        async with FleetClient(state.endpoint, operator="ann") as client:
+            seen = Distances(client)
+            await fly(client, drone_1="(6, 25, 8)", drone_2="(36, 27, 8)")
+            seen.least = math.inf
+            await fly(client, drone_1="(37, 13, 8)", drone_2="(5, 13, 8)")
+            assert seen.least >= 2 * DRONE_M
+            seen.close()
+        logs = sorted(Path(state.record_dir).glob("*.mcap"))
+        report = check(logs)
+        assert report.same, report.divergences
+        decided = [each for log in logs for each in read(log) if each.key.endswith("/decided/way")]
+        cases = [msgspec.json.decode(each.payload, type=WayCase) for each in decided]
+        assert any(case.trip.flies and case.wants for case in cases)
 
 
 @asynccontextmanager

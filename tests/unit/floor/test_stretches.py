@@ -20,7 +20,11 @@ WAYS = st.lists(SPOTS, min_size=2, max_size=4)
 
 @st.composite
 def floors(draw: st.DrawFn) -> tuple[Floor, dict[str, Body], Trip]:
-    """Draw a site with racks, robots on their ways or waiting for one, and where robot `a` wants to go."""
+    """Draw a site with racks, robots on their ways or waiting for one, and where robot `a` wants to go.
+
+    All drive, or all fly at one height and `a` takes off.
+    """
+    height = draw(st.sampled_from((0.0, 0.0, 10.0)))
     racks = draw(st.lists(st.tuples(st.integers(1, 8), st.integers(1, 5)), max_size=6, unique=True))
     site = Site(
         places={"dock 1": Place(x=35.0, y=25.0)},
@@ -30,7 +34,8 @@ def floors(draw: st.DrawFn) -> tuple[Floor, dict[str, Body], Trip]:
         ),
     )
     seen = {"a": Body(robot="a", at=draw(SPOTS), size=SIZE)}
-    for number, way in enumerate(draw(st.lists(WAYS, max_size=4))):
+    for number, flat in enumerate(draw(st.lists(WAYS, max_size=4))):
+        way = [(x, y, height) for x, y, _ in flat]
         cut = draw(st.integers(2, len(way)))
         moves = draw(st.booleans())
         state = FloorState(
@@ -41,8 +46,10 @@ def floors(draw: st.DrawFn) -> tuple[Floor, dict[str, Body], Trip]:
             wants=tuple(way[cut:]) if moves else (),
         )
         seen[state.robot] = Body(robot=state.robot, at=way[0], size=SIZE, state=state, stands=not moves)
-    points = tuple(draw(st.lists(SPOTS, min_size=1, max_size=2)))
-    return Floor(site), seen, Trip(robot="a", task="t", command="t/1", points=points)
+    points = [(x, y, height) for x, y, _ in draw(st.lists(SPOTS, min_size=1, max_size=2))]
+    if height:
+        points.insert(0, (*seen["a"].at[:2], height))
+    return Floor(site), seen, Trip(robot="a", task="t", command="t/1", points=tuple(points), flies=height > 0.0)
 
 
 def near(points: tuple[Point, ...], others: tuple[Point, ...]) -> bool:
