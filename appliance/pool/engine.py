@@ -53,6 +53,8 @@ RUNC_REMEDY = (
 )
 """Podman before 4.4 takes the OCI runtime from its own configuration only, whatever a request asks for."""
 # Labels of containers and volumes.
+_LISTED_AGAIN = 3
+_LIST_PAUSE_S = 0.2
 LABEL_FLEET = "swiftbot.fleet"
 LABEL_GATEWAY = "swiftbot.gateway"
 LABEL_IMAGE = "swiftbot.image"
@@ -436,6 +438,11 @@ class PodmanEngine:
                 if each.get("RepoTags")
             ]
 
+        for _ in range(_LISTED_AGAIN):
+            try:
+                return await self._ask("list images", work)
+            except PrerequisiteError:  # one of them was removed while Podman made the list
+                await asyncio.sleep(_LIST_PAUSE_S)
         return await self._ask("list images", work)
 
     async def image(self, reference: str) -> ImageFacts:
