@@ -12,6 +12,7 @@ import msgspec
 import tomli_w
 from msgspec import Struct, field
 
+from appliance.alerts.settings import AlertsConfig
 from appliance.errors import ConfigError, PayloadError
 from appliance.floor.settings import FloorConfig
 from appliance.llm.settings import LlmConfig, SafetyConfig
@@ -57,6 +58,7 @@ class GatewayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     record: RecordConfig = field(default_factory=RecordConfig)
     tasks: TasksConfig = field(default_factory=TasksConfig)
     observe: ObserveConfig = field(default_factory=ObserveConfig)
+    alerts: AlertsConfig = field(default_factory=AlertsConfig)
 
     def endpoints(self) -> tuple[str, ...]:
         """Where this gateway and the others are reached, by its configuration, each once."""
@@ -115,6 +117,7 @@ def check(config: GatewayConfig, source: str) -> None:
         config.llm.check()
         config.safety.check()
         config.observe.check()
+        config.alerts.check()
     except (PayloadError, ConfigError) as error:
         raise ConfigError(f"{source}: {error.message}", remedy=error.remedy) from error
     if config.log_level not in ("debug", "info", "warning", "error"):

@@ -25,8 +25,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from appliance import logs, process
-from appliance.alerts import Keeper
-from appliance.alerts.keeper import disk_mb
+from appliance.alerts.delivery import Delivery
+from appliance.alerts.keeper import Keeper, disk_mb
+from appliance.alerts.messages import sender
 from appliance.charging.keeper import Charging
 from appliance.closures import keeper as closures
 from appliance.closures.keeper import Closures
@@ -53,7 +54,7 @@ from appliance.model import (
     gateways,
     keyspace,
 )
-from appliance.model.alerts import AlertsAsk
+from appliance.model.alerts import Alert, AlertsAsk
 from appliance.model.planner_api import ProposeAsk, Proposed, SwapAsk, Swapped
 from appliance.model.recorder_api import RecorderStatus
 from appliance.model.robot_api import LinksAsk
@@ -269,6 +270,8 @@ class Gateway:
         self._parts = ALL
         self._observer: Observer | None = None
         """Tells monitoring systems; None: nothing of that is on."""
+        self._delivery: Delivery | None = None
+        """Delivers alerts outside of the fleet; None: there are no addresses."""
 
     async def start(self) -> None:
         """Build and start every part; on failure, what was started is stopped again and the error raised."""
@@ -421,7 +424,9 @@ class Gateway:
             "session": self.plane.until_gone(),
             "retention": self._retention.run(),
             "copies of files": copies.run(),
-        } | ({"observer": observer.run()} if observer else {})
+        }
+        root_tasks |= {"observer": observer.run()} if observer else {}
+        root_tasks |= {"delivery of alerts": self._delivery.run()} if self._delivery else {}
         for name, work in root_tasks.items():
             self._stack.push_async_callback(self.supervisor.start(name, work))
         log.info("gateway is up", gateway=config.id, fleet=config.fleet, pid=os.getpid())
@@ -569,9 +574,33 @@ class Gateway:
         return OutOfUse(places=self.closures.places, robots=self.closures.robots)
 
     def _keep_alerts(self, audit: Audit) -> None:
-        self._alerts = Keeper(self.plane, in_maintenance=lambda: self.closures.robots)
+        if self.config.alerts.urls_file:
+            self._delivery = Delivery(
+                self.config.alerts,
+                fleet=self.config.fleet,
+                mine=self._delivers,
+                alerts=lambda: self._alerts.alerts(AlertsAsk()),
+                mark=self._mark_delivered,
+                on_change=self._changed.set,
+            )
+        self._alerts = Keeper(
+            self.plane,
+            in_maintenance=lambda: self.closures.robots,
+            on_alert=self._delivery.hear if self._delivery else None,
+        )
         self._alerts.start(audit.signed)
         self._stack.push_async_callback(self._alerts.close)
+
+    async def _mark_delivered(self, alert: Alert) -> None:
+        await self._alerts.delivered(alert)
+
+    def _delivers(self) -> bool:
+        """Whether it is this gateway that delivers alerts outside."""
+        return sender({**self._gateways_there(), self.config.id: self.status()}) == self.config.id
+
+    def _gateways_there(self) -> dict[str, GatewayStatus]:
+        members = self.plane.members()
+        return {name: status for name, status in self.plane.registry.gateways.items() if name in members}
 
     async def _start_planner(self, catalogue: Catalogue) -> None:
         config, plane = self.config, self.plane
@@ -579,11 +608,7 @@ class Gateway:
         async def ask(gateway: str, asked: ProposeAsk, timeout_s: float) -> Proposed:
             return await plane.rpc.call(gateway, keyspace.PROPOSE, asked, timeout_s=timeout_s)
 
-        def gateways() -> dict[str, GatewayStatus]:
-            members = plane.members()
-            return {name: status for name, status in plane.registry.gateways.items() if name in members}
-
-        peers = PeerTier(config.llm, gateways=gateways, ask=ask, here=config.id)
+        peers = PeerTier(config.llm, gateways=self._gateways_there, ask=ask, here=config.id)
         self.decomposer = Decomposer(
             config.llm, catalogue, safety=config.safety, gateway=config.id, peers=peers, check_model=self._check_model
         )  # fmt: skip
@@ -774,6 +799,7 @@ class Gateway:
             models=self.decomposer.models,
             planner=self.decomposer.status,
             recorders=self._recorders.notes(time.monotonic()),
+            delivery=self._delivery.status if self._delivery else None,
             robots=self.hub.attached,
             stops=self.authority.active[:SHOWN],
             leases=self.authority.leases[:SHOWN],

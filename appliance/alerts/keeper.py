@@ -67,9 +67,17 @@ class Keeper:
     Args:
         plane: what it knows of the fleet, and keeps records by.
         in_maintenance: robots that are out of use, by name.
+        on_alert: called with each alert as it is now, or is over.
     """
 
-    def __init__(self, plane: Plane, *, in_maintenance: Callable[[], Mapping[str, str]] = dict) -> None:
+    def __init__(
+        self,
+        plane: Plane,
+        *,
+        in_maintenance: Callable[[], Mapping[str, str]] = dict,
+        on_alert: Callable[[Alert], None] | None = None,
+    ) -> None:
+        self._hear = on_alert
         self._in_maintenance = in_maintenance
         self._plane = plane
         self._kept: dict[str, Alert] = {}
@@ -159,6 +167,8 @@ class Keeper:
         self._changed.set()
 
     def _take(self, alert: Alert) -> None:
+        if self._hear is not None:
+            self._hear(alert)
         if alert.cleared_ns:
             self._kept.pop(alert.id, None)
             if rules.given_up(alert, now_ns=alert.cleared_ns):
@@ -407,6 +417,22 @@ class Keeper:
                 acked.append(alert)
         return AlertsAcked(alerts=tuple(acked), unknown=tuple(unknown))
 
+    async def delivered(self, alert: Alert) -> None:
+        """Note in the record of an alert that it is delivered outside; one that has changed is left as it is.
+
+        Raises:
+            SwiftbotError: it cannot be written now.
+        """
+        stored = await self._stored(alert.id)
+        known = _decoded(stored)
+        if stored is None or known is None or (known.since_ns, known.level) != (alert.since_ns, alert.level):
+            return
+        if not known.told_ns:
+            known = replace(known, told_ns=time.time_ns())
+            await self._plane.dht.write(_key(alert.id), encode(known), expected=stored.version)
+        self._take(known)
+        self._plane.session.publish(keyspace.ALERT, known, known.id)
+
     async def _acknowledge(self, name: str, word: Word) -> Alert | None:
         """Acknowledge one; None where there is none of that id."""
         for _ in range(TRIES):
@@ -436,7 +462,7 @@ def _kept_on(before: Alert, alert: Alert) -> Alert:
     if before.acked is not None and alert.acked is None and alert.kind in rules.HAPPENED and alert.what != before.what:
         return alert  # it has happened again since it was acknowledged
     return replace(alert, since_ns=min(before.since_ns, alert.since_ns) or alert.since_ns,
-                   acked=None if worse else before.acked)  # fmt: skip
+                   acked=None if worse else before.acked, told_ns=0 if worse else before.told_ns)  # fmt: skip
 
 
 def _key(name: str) -> str:

@@ -25,6 +25,8 @@ CRITICAL, WARNING = AlertLevel.CRITICAL, AlertLevel.WARNING
 DISK_WARNING_MB = 2048
 """Free on the disk of a gateway's data, MiB: below it runs, records and logs are near their reserves."""
 DISK_CRITICAL_MB = 512
+DELIVERY = "delivery"
+"""Kind of the alert that others are not delivered."""
 CLOCK_S = 2.0
 """A clock that differs by more makes logs of several gateways hard to read, and times of day wrong."""
 MOST = 500
@@ -132,6 +134,9 @@ def _gateways(facts: Facts) -> Iterator[Finding]:
             level = CRITICAL if status.disk_free_mb < DISK_CRITICAL_MB else WARNING
             what = f"{status.disk_free_mb:,} MiB free of {status.disk_total_mb:,} on the disk of its data"
             yield of("disk", level, what, "remove files there; `swiftbot pool evict`, `record.max_bytes`")
+        if status.delivery is not None and status.delivery.problem:
+            what = f"alerts are not delivered: {status.delivery.problem}"
+            yield of(DELIVERY, WARNING, what, "mend alerts.urls_file or the network; `swiftbot alerts test` there")
         slot = status.planner.slot if status.planner is not None else None
         if slot is not None and slot.state == "down":
             told = f": {slot.problem}" if slot.problem else ""
@@ -281,7 +286,9 @@ def renewed(alert: Alert, finding: Finding, *, gateway: str, now_ns: int) -> Ale
     worse = finding.level is CRITICAL and alert.level is not CRITICAL
     if not worse and now_ns - alert.changed_ns < SPACING_S * 1e9:
         return None
-    return replace(fresh, acked=None if worse else alert.acked, changed_ns=now_ns, gateway=gateway)
+    if worse:
+        fresh = replace(fresh, acked=None, told_ns=0)
+    return replace(fresh, changed_ns=now_ns, gateway=gateway)
 
 
 def reported(kept: Mapping[str, Alert], finding: Finding, *, gateway: str, now_ns: int) -> Alert | None:

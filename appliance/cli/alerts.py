@@ -1,7 +1,8 @@
-"""Alerts: `swiftbot alerts`, `alerts ack`."""
+"""Alerts: `swiftbot alerts`, `alerts ack`, `alerts test`."""
 
 import asyncio
 import time
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
@@ -134,6 +135,34 @@ async def alerts_ack(
         found = await client.acknowledge(alerts, why=why)
     show(found, as_json=as_json, table=acked_text(found))
     return Exit.FAILED if found.unknown else Exit.DONE
+
+
+@alerts_app.command(name="test")
+async def alerts_test(
+    *,
+    config: Annotated[Path, Parameter(name="--config", help="The gateway's TOML file.")] = Path(
+        "/etc/swiftbot/gateway.toml"
+    ),
+    as_json: Json = False,
+) -> int:
+    """Send a test message to each address of alerts.urls_file from this machine. Exit code 1: one did not take it."""
+    from appliance.alerts.delivery import read_addresses
+    from appliance.config import load
+
+    read = load(config)
+    if not read.alerts.urls_file:
+        raise ConfigError(
+            f"{config} names no addresses for alerts", remedy='set alerts.urls_file = "/etc/swiftbot/alerts.urls"'
+        )
+    addresses, wrong = await asyncio.to_thread(read_addresses, read.alerts.file)
+    told = f"A test by {read.id}: alerts of fleet {read.fleet} are delivered here."
+    problems = dict.fromkeys(wrong, "no message was sent there")
+    for each in addresses:
+        problems[each.name] = await asyncio.to_thread(each.send, f"SwiftBot {read.fleet}: test", told)
+    lines = [f"✘ {name}: {problem}" if problem else f"✔ {name}" for name, problem in problems.items()]
+    rows = [{"address": name, "taken": not problem, "problem": problem} for name, problem in problems.items()]
+    show(rows, as_json=as_json, table=Text("\n".join(lines)))
+    return Exit.FAILED if any(problems.values()) else Exit.DONE
 
 
 async def _confirmed(count: int) -> bool:

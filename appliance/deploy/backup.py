@@ -272,7 +272,7 @@ def named_in(config: GatewayConfig) -> Iterator[Path]:
         config.site,
         *config.skills,
     ]
-    named += [config.llm.local_model, config.llm.upstream_key_file]
+    named += [config.llm.local_model, config.llm.upstream_key_file, config.alerts.urls_file]
     named += [link.signing for link in config.robots.mavlink]
     for each in named:
         if each and "/" in each and not each.startswith("credential:"):

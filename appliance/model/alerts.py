@@ -49,6 +49,8 @@ class Alert(Struct, frozen=True, kw_only=True, omit_defaults=True):
     changed_ns: int = 0
     acked: Word | None = None
     """Who has acknowledged it, and why; None: nobody yet."""
+    told_ns: int = 0
+    """When all addresses outside of the fleet were told of it (`alerts.urls_file`); 0: not yet, or there are none."""
     cleared_ns: int = 0
     """When it was over; only in the last put of it."""
     gateway: str = ""

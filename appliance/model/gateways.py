@@ -164,6 +164,17 @@ class RecorderNote(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Time of the last one that is missing."""
 
 
+class Deliveries(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How a gateway does that delivers alerts to addresses outside of the fleet."""
+
+    sent: int = 0
+    """Messages that were taken, since start."""
+    failed: int = 0
+    """Attempts that were refused or came to nothing."""
+    problem: str = ""
+    """Why it does not deliver, by address; empty when all is well."""
+
+
 PROTOCOL = 1
 """What gateways of this version say to each other: keys, messages and records. One higher with each change that an
 older one cannot ignore: a new field with a default is none."""
@@ -254,6 +265,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """How its planner does; a change of it alone goes out with the next status."""
     recorders: tuple[RecorderNote, ...] = ()
     """The fleet's recorders as this gateway hears them; told at once when one misses messages."""
+    delivery: Deliveries | None = None
+    """How it delivers alerts outside of the fleet; None: it is not set to."""
     robots: tuple[str, ...] = ()
     endpoints: tuple[str, ...] = ()
     refused: dict[str, int] = field(default_factory=dict[str, int])

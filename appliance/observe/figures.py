@@ -11,6 +11,7 @@ from typing import Literal
 from msgspec import Struct
 
 from appliance.observe.facts import Facts
+from appliance.record.models import SILENT
 
 Row = tuple[float, dict[str, str]]
 """A value and its labels."""
@@ -64,6 +65,11 @@ def _robots(facts: Facts) -> list[Row]:
     return [(online, {"online": "yes"}), (len(facts.robots) - online, {"online": "no"})]
 
 
+def _deliveries(facts: Facts) -> list[Row]:
+    told = facts.status.delivery
+    return [] if told is None else [(told.sent, {"outcome": "sent"}), (told.failed, {"outcome": "failed"})]
+
+
 def _link_frames(facts: Facts) -> list[Row]:
     return [
         (count, {"link": link.url, "direction": direction})
@@ -107,11 +113,14 @@ METRICS = (
     Metric("swiftbot.link.refused", "counter", "{frame}", "MAVLink frames that were damaged, not believed or not sent",
            lambda facts: [(sum(link.refused.values()), {"link": link.url}) for link in facts.links]),
     Metric("swiftbot.recorder.recording", "gauge", "{recorder}", "1 while a recorder of the fleet records",
-           lambda facts: [(int(not each.problem), {"recorder": each.id}) for each in facts.status.recorders]),
+           lambda facts: [(int(not each.problem and each.state != SILENT), {"recorder": each.id})
+                          for each in facts.status.recorders]),
     Metric("swiftbot.recorder.missed", "counter", "{message}", "Messages of the fleet that are not in a recorder's log",
            lambda facts: [(each.missed, {"recorder": each.id}) for each in facts.status.recorders]),
     Metric("swiftbot.alerts", "gauge", "{alert}", "Alerts kept by this gateway; over all gateways, the fleet's",
            _alerts),
+    Metric("swiftbot.alerts.deliveries", "counter", "{message}", "Messages to addresses outside, by outcome",
+           _deliveries),
     Metric("swiftbot.refused", "counter", "{input}", "Bad input that was refused, by kind",
            lambda facts: _each(_kinds(facts.status.refused), "kind")),
 )  # fmt: skip

@@ -236,7 +236,7 @@ WITH_PATHS = (
     "router --listen x --keys @", "images fetch x --skills @",
     "parts list --without-images --config @", "parts list --without-images --out @", "parts sign @", "parts show @",
     "parts show --keys @", "parts check --without-images --config @", "parts install @ --config a.toml",
-    "parts install a.toml --config @", "manual @",
+    "parts install a.toml --config @", "manual @", "alerts test --config @",
 )  # fmt: skip
 """Command lines with each path that a command takes, the others good, so that this one is reached."""
 

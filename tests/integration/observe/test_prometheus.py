@@ -24,7 +24,7 @@ from appliance.model import (
     TaskState,
 )
 from appliance.model.alerts import Alert, AlertLevel
-from appliance.model.gateways import PlannerStatus, RecorderNote, TierFigures
+from appliance.model.gateways import Deliveries, PlannerStatus, RecorderNote, TierFigures
 from appliance.model.robot_api import LinkFacts
 from appliance.model.transitions import Transition, TransitionKind
 from appliance.observe.facts import Facts
@@ -62,6 +62,7 @@ class Work:
                 capacity=8, running=1, refused={"malformed status": count},
                 recorders=(RecorderNote(id="recorder", state="recording", missed=count),),
                 planner=PlannerStatus(tiers={"rules": TierFigures(asked=2 * count, failed=count)}),
+                delivery=Deliveries(sent=count, failed=count),
             ),
             containers=(ContainerInfo(id="c1", gateway="gw-1", image="base", state=ContainerState.READY),),
             alerts=(Alert(id="a", kind="k", level=AlertLevel.CRITICAL, what="w", subject="robot", name="r"),),

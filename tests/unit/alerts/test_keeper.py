@@ -7,7 +7,8 @@ import anyio
 import pytest
 from msgspec.structs import replace
 
-from appliance.alerts import Keeper, keeper
+from appliance.alerts import keeper
+from appliance.alerts.keeper import Keeper
 from appliance.errors import UnreachableError
 from appliance.model import GatewayStatus, TaskState, VersionVector, Word, encode, keyspace
 from appliance.model.alerts import Alert, AlertLevel, Subject

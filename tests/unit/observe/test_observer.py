@@ -34,7 +34,7 @@ from appliance.model import (
     Word,
 )
 from appliance.model.alerts import Alert, AlertLevel
-from appliance.model.gateways import PlannerStatus, RecorderNote, TierFigures
+from appliance.model.gateways import Deliveries, PlannerStatus, RecorderNote, TierFigures
 from appliance.model.robot_api import LinkFacts
 from appliance.model.transitions import Transition, TransitionKind
 from appliance.observe.facts import Facts
@@ -51,6 +51,7 @@ FACTS = Facts(
         running=2, queue=3, refused={"unauthorized gw/a/rpc/b": 2, "unauthorized gw/a/rpc/c": 1},
         recorders=(RecorderNote(id="recorder", state="recording", missed=7),),
         planner=PlannerStatus(tiers={"rules": TierFigures(asked=5, failed=1)}),
+        delivery=Deliveries(sent=4, failed=1),
     ),
     containers=(ContainerInfo(id="c1", gateway="gw-1", image="base", state=ContainerState.READY),),
     alerts=(
