@@ -125,6 +125,7 @@ from appliance.model.task_api import (
     EnquiryList,
     ExperienceAsk,
     ExperienceList,
+    FirstAsk,
     Line,
     MigrateAsk,
     Migrated,
@@ -242,6 +243,10 @@ class SteeringCalls(FleetConnection):
     async def retry(self, task: str, subtask: str = "", *, why: str = "") -> TaskRecord:
         """Try again what failed or was cancelled; what has succeeded is kept."""
         return await self._ask(keyspace.RETRY, RetryAsk(id=task, subtask=subtask, **self._sign(why)))
+
+    async def first(self, task: str, *, before: str = "", why: str = "") -> TaskRecord:
+        """Put a task before all that wait for its robots, or right before one; RefusedError where none waits."""
+        return await self._ask(keyspace.FIRST, FirstAsk(id=task, before=before, **self._sign(why)))
 
     async def cancel(self, task: str, *, why: str = "") -> TaskRecord:
         """Stop a task; returns what came of it, which `cancel_outcome` says in words."""

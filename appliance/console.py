@@ -26,6 +26,7 @@ from appliance.model import (
     Provenance,
     RecorderNote,
     RobotInfo,
+    RobotWork,
     SubtaskRecord,
     SubtaskState,
     TaskRecord,
@@ -580,6 +581,26 @@ def robot_table(robots: Sequence[RobotInfo], held: Mapping[str, str] | None = No
         table.add_row(
             each.id, each.kind, each.gateway or "direct", ", ".join(each.uses), pose, battery, each.mode, state
         )
+    return table
+
+
+QUEUE_STATES = {
+    "runs": "runs",
+    "begun": "has begun, the robot is its own",
+    "ready": "waits for its turn",
+    "later": "waits for something else",
+}
+"""`RobotWork.state` in words."""
+
+
+def queue_table(work: Sequence[RobotWork]) -> Table:
+    """What tasks have for robots, a line each, in order."""
+    table = Table(box=None, pad_edge=False, header_style="bold dim")
+    for name in ("robot", "task", "state", "priority", "takes"):
+        table.add_column(name, overflow="fold")
+    for each in work:
+        state = QUEUE_STATES.get(each.state, each.state)
+        table.add_row(each.robot, each.task, state, str(each.priority), f"{each.takes_s:.0f} s")
     return table
 
 

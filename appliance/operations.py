@@ -86,6 +86,7 @@ Folder = Annotated[str, Kind("text", "Folder on that gateway, made for onnxrunti
 Reference = Annotated[str, Kind("text", "Full image reference.")]
 Answer = Annotated[str, Kind("text", "Answer; one of the choices where there are any.", rest=True)]
 Why = Annotated[str, Kind("text", "Reason, recorded in the audit log.", rest=True)]
+BeforeTask = Annotated[str, Kind("task", "Task that it goes right before; none: all that wait.", absent="")]
 HoldRuns = Annotated[bool, "Also end runs that save checkpoints; they continue from there."]
 LeaseSeconds = Annotated[float, "Seconds until it ends without `robots renew`.", Meta(ge=1, le=120)]
 Reason = Annotated[str, "Reason, recorded in the audit log."]
@@ -414,6 +415,21 @@ async def hold(client: FleetClient, task: TaskId, *, why: Why = "") -> Outcome:
 async def resume(client: FleetClient, task: TaskId, *, why: Why = "") -> Outcome:
     """Resume a paused task."""
     return Outcome(value=await client.resume(task, why=why))
+
+
+@operation(
+    "task first",
+    title="First",
+    keys=("u",),
+    screens=("tasks", "task"),
+    role=Role.OPERATOR,
+    audit="first",
+    footer=False,
+)
+async def first(client: FleetClient, task: TaskId, *, before: BeforeTask = "", why: Why = "") -> Outcome:
+    """Put a task before the others that wait for its robots; one that has begun is not stopped."""
+    record = await client.first(task, before=before, why=why)
+    return Outcome(value=record, text=f"task {task} goes before {before or 'the others'}, priority {record.priority}")
 
 
 @operation(

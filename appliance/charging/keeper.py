@@ -116,7 +116,7 @@ class Charging:
                 await self._send(trip)
 
     def _seen(self) -> list[Seen]:
-        busy = {each.robot for each in self._work_of_fleet()} | set(self._sent)
+        busy = {each.robot for each in self._work_of_fleet() if each.state != "later"} | set(self._sent)
         bodies, found = self._floor.bodies(), list[Seen]()
         for name, info in self._plane.registry.robots.items():
             body = bodies.get(name)

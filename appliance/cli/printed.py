@@ -13,7 +13,7 @@ from appliance.cli.robots import RobotShown
 from appliance.deploy.backup import Contents
 from appliance.deploy.support import Collected
 from appliance.deploy.upgrade import Ended
-from appliance.model import Act, ContainerInfo, Enquiry, Lease
+from appliance.model import Act, ContainerInfo, Enquiry, Lease, RobotWork
 from appliance.model.alerts import Alert, AlertsAcked
 from appliance.model.closures import Closure
 from appliance.model.learn_api import ClientWhy, LearnEvaluated, LearnShown
@@ -73,6 +73,7 @@ PRINTED: dict[str, Any] = {
     "robots links remove": LinkFacts,
     "robots list": list[RobotShown],
     "robots maintain": Closure,
+    "robots queue": list[RobotWork],
     "robots release": Lease,
     "robots renew": Lease,
     "robots takeover": Lease,

@@ -21,6 +21,7 @@ from appliance.cli.drive import robots_drive
 from appliance.client import FleetClient
 from appliance.errors import ConfigError, ConflictError, Exit, NotFoundError, RefusedError, SwiftbotError
 from appliance.model import Lease, RobotInfo, SubtaskState, TaskState
+from appliance.model.gateways import queues
 from appliance.model.keys import check_name
 from appliance.model.robot_api import LinkAdd, LinkFacts, LinkList, LinkRemove, MavlinkLink, RobotForget, Standing
 from appliance.robots.authority.soft_stop import Stops
@@ -52,6 +53,26 @@ async def robots_list(*, as_json: Json = False, where: Where = HERE) -> int:
     if unsure:
         console.err.print(f"which robots are stopped or taken over is not known: {unsure}", markup=False)
     return Exit.FAILED if unsure else Exit.DONE
+
+
+@robots_app.command(name="queue")
+async def robots_queue(robot: str = "", *, as_json: Json = False, where: Where = HERE) -> int:
+    """List the tasks that robots do and that wait for them, in order; `swiftbot task first` puts one before others.
+
+    Args:
+        robot: Of this one alone.
+        as_json: Print JSON.
+        where: The fleet.
+    """
+    async with where.client() as client:
+        await client.gateway()
+        roster, members = client.plane.registry.robots, client.plane.members()
+        if robot and robot not in roster:
+            raise NotFoundError(f"no robot {robot[:60]!r}", remedy="`swiftbot robots` lists them")
+        statuses = [each for name, each in client.plane.registry.gateways.items() if name in members]
+    found = [each for each in queues(statuses) if robot in ("", each.robot)]
+    show(found, as_json=as_json, table=console.queue_table(found))
+    return Exit.DONE
 
 
 async def robots_now(client: FleetClient) -> tuple[list["RobotShown"], str]:

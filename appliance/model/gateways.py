@@ -3,10 +3,13 @@
 Of its planner a gateway tells the tiers, the model's process, the plan cache, and what upstream may still cost.
 """
 
+from collections.abc import Iterable
+
 from msgspec import Struct, field
 
 from appliance.model.messages import Need, OpenEnum
 from appliance.model.steering import Lease, SoftStop
+from appliance.model.tasks import PLAIN_PRIORITY
 
 
 class TierFigures(Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -190,6 +193,19 @@ class RobotWork(Struct, frozen=True, kw_only=True, omit_defaults=True):
     task: str
     takes_s: float = 0.0
     """As long as that is expected to take."""
+    state: str = "later"
+    """`runs`: a run of it has the robot; `begun`: the task has begun, and the robot is its own up to its end;
+    `ready`: it waits for its turn; `later`: it waits for something else first, and others go before it."""
+    priority: int = PLAIN_PRIORITY
+    place_ns: int = 0
+    """Among tasks of the same priority the lower goes first: when it was accepted, unless an operator has moved it."""
+    uses: tuple[str, ...] = ()
+    """Parts of the robot that it needs: tasks that share none do not wait for each other."""
+
+    @property
+    def rank(self) -> tuple[bool, int, int, str]:
+        """The lower goes first. The order is the same for all robots, so that no two tasks wait for each other."""
+        return self.state not in ("runs", "begun"), -self.priority, self.place_ns, self.task
 
 
 MOST_WORK = 200
@@ -291,6 +307,15 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """It will be put again within so long, changed or not."""
     asked: dict[str, float] = field(default_factory=dict[str, float])
     """Image -> placements a second that this gateway decides, to the next power of two."""
+
+
+def queues(statuses: Iterable[GatewayStatus]) -> list[RobotWork]:
+    """Return what tasks have for robots, robot by robot, in the order in which they go (pure).
+
+    While a task changes hands two gateways tell of it; it is listed once.
+    """
+    found = {(each.robot, each.task): each for status in statuses for each in status.work}
+    return sorted(found.values(), key=lambda each: (each.robot, each.state != "runs", each.state == "later", each.rank))
 
 
 def works_beside(status: GatewayStatus) -> bool:

@@ -768,6 +768,14 @@ RETRY = Verb(
     asks=STEERING,
     signed=True,
 )
+FIRST = Verb(
+    "first",
+    task_api.FirstAsk,
+    TaskRecord,
+    "put a task before others that wait for the same robot; none that has begun is stopped",
+    asks=STEERING,
+    signed=True,
+)
 APPROVE = Verb(
     "approve",
     task_api.ApproveAsk,

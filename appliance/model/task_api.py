@@ -534,6 +534,14 @@ class RetryAsk(Signed, frozen=True, kw_only=True):
     here: bool = False
 
 
+class FirstAsk(Signed, frozen=True, kw_only=True):
+    """`first`: a task goes before the others that wait for its robots, or right before the one that is named."""
+
+    id: str
+    before: str = ""
+    here: bool = False
+
+
 class CancelTaskAsk(Signed, frozen=True, kw_only=True):
     """`cancel`, `cancel_here`: which task."""
 

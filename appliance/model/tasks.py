@@ -465,6 +465,10 @@ class TaskRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The last word of an operator on a plan of it."""
     pauses: tuple[Pause, ...] = ()
     """Why no subtask is started; empty: nothing hinders that."""
+    place_ns: int = 0
+    """Orders it among tasks of the same priority that wait for the same robot; 0: `created_ns` does."""
+    ranked_by: Word | None = None
+    """Who has put it before others last, and why."""
     cancelled_by: Word | None = None
     """Who asked to stop it, and why."""
     retried_by: Word | None = None

@@ -68,6 +68,8 @@ class TransitionKind(StrEnum):
     """A run is ended, and its subtask waits for another attempt although nothing was wrong with it (`note`: why)."""
     RETRIED = "retried"
     """An operator has what has failed tried again: a task that has ended, or one `subtask` (`word`)."""
+    RANKED = "ranked"
+    """An operator puts it before others that wait for the same robot (`priority`, `place_ns`, `word`)."""
     REPLANNED = "replanned"
     """What was proposed takes effect; `plan` is the plan from now on, with all that is finished."""
     REPLAN_FAILED = "replan failed"
@@ -86,6 +88,8 @@ class Transition(Struct, frozen=True, kw_only=True, omit_defaults=True):
     submitter: str = ""
     plan: Plan | None = None
     priority: int = PLAIN_PRIORITY
+    place_ns: int = 0
+    """On `ranked`: as `TaskRecord.place_ns`."""
     deadline_s: float = 0.0
     within: tuple[str, ...] = ()
     group: Group | None = None

@@ -101,6 +101,7 @@ def orders_of(record: TaskRecord) -> tuple[LostOrder, ...]:
     said = [
         ("cancel", record.cancelled_by),
         ("retry", record.retried_by),
+        ("first", record.ranked_by),
         ("approve" if decision is not None and decision.approved else "reject", decision),
         *(("pause", each) for each in record.pauses if not each.stop),
     ]
@@ -334,6 +335,7 @@ def overruled(split: Split, record: TaskRecord) -> tuple[LostOrder, ...]:
         "approve": decision is not None and decision.approved,
         "reject": stopped or (decision is not None and not decision.approved),
         "retry": record.retried_by is not None,
+        "first": record.ranked_by is not None,
         "pause": any(not each.stop for each in record.pauses),
     }
     return tuple(each for each in split.orders if each not in mine and not effective.get(each.verb, False))

@@ -54,7 +54,7 @@ from appliance.model import (
     TaskRecord,
     TaskState,
 )
-from appliance.model.task_api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk, RunStatus
+from appliance.model.task_api import ApproveAsk, FirstAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk, RunStatus
 from appliance.tasks import machine
 from appliance.tasks.conflicts import OVERTAKEN, foreign
 from appliance.tasks.context import Context
@@ -104,8 +104,9 @@ from appliance.tasks.replan import (
     splice,
     worth_replanning,
 )
-from appliance.tasks.steering import may_pause, may_resume, may_retry, needed_robots, proposal_for, word_of
+from appliance.tasks.steering import may_move, may_pause, may_resume, may_retry, needed_robots, proposal_for, word_of
 from appliance.tasks.timing import Backoff, left_s, passed
+from appliance.tasks.turns import moved_before
 from appliance.tasks.views import WAITS
 
 log = structlog.get_logger(__name__)
@@ -426,6 +427,10 @@ class Decider:
                 reason = self._robot_missing(target, reason, now)
                 if reason:
                     self._wait(target, reason, now)
+                return
+            if first := context.scheduler.goes_first(self.record, target, robots):
+                self._startup_begins(target)
+                self._wait(target, first, now)
                 return
         robot, others = next(iter(robots), None), robots[1:]
         placement = context.scheduler.place(self.record, target, robot)
@@ -947,6 +952,8 @@ class Decider:
                         self._go_on()
                 case RetryAsk():
                     self._retry(event.ask)
+                case FirstAsk():
+                    self._move_first(event.ask)
         except SwiftbotError as refusal:
             error = refusal
         self._out.append(Answer(to=event, error=error))
@@ -1015,6 +1022,13 @@ class Decider:
         note = f"tried again by {ask.by or 'an operator'}"
         self._draft.apply(TransitionKind.RETRIED, subtask=ask.subtask, note=note, word=word_of(ask))
         self._out.extend(EndRun(target) for target in left)
+        self._go_on()
+
+    def _move_first(self, ask: FirstAsk) -> None:
+        if not may_move(self.record, ask):
+            return
+        priority, place_ns = moved_before(self.record, tuple(self._context.scheduler.fleet_work()), ask.before)
+        self._draft.apply(TransitionKind.RANKED, priority=priority, place_ns=place_ns, word=word_of(ask))
         self._go_on()
 
     def _follow_robots(self) -> None:

@@ -26,6 +26,7 @@ from appliance.model.task_api import (
     ApproveAsk,
     CancelTaskAsk,
     CandidateWhy,
+    FirstAsk,
     PauseAsk,
     RejectAsk,
     ResumeAsk,
@@ -51,7 +52,7 @@ from appliance.tasks.record_writer import Draft, RecordWriter, SupersededError
 from appliance.tasks.records import PREFIX, read_record, task_key, unknown
 from appliance.tasks.retention import TRIMMED
 from appliance.tasks.scheduler import Scheduler
-from appliance.tasks.steering import may_pause, may_resume, may_retry, proposal_for, revived
+from appliance.tasks.steering import may_move, may_pause, may_resume, may_retry, proposal_for, revived
 from appliance.tasks.timing import left_s
 from appliance.tasks.views import WAITS, why, with_waits
 
@@ -342,12 +343,12 @@ STEER_S = 4.0
 """How long an order may take to be written: a replicated write takes milliseconds, an inbox that is full a second."""
 TRIES = 20
 
-Ask = ApproveAsk | RejectAsk | PauseAsk | ResumeAsk | RetryAsk
-A = TypeVar("A", ApproveAsk, RejectAsk, PauseAsk, ResumeAsk, RetryAsk)
+Ask = ApproveAsk | RejectAsk | PauseAsk | ResumeAsk | RetryAsk | FirstAsk
+A = TypeVar("A", ApproveAsk, RejectAsk, PauseAsk, ResumeAsk, RetryAsk, FirstAsk)
 
 
 class OperatorVerbs:
-    """The verbs `approve`, `reject`, `pause`, `resume` and `retry` of one gateway.
+    """The verbs `approve`, `reject`, `pause`, `resume`, `retry` and `first` of one gateway.
 
     Args:
         plane: the fleet.
@@ -386,6 +387,7 @@ class OperatorVerbs:
         rpc.register(keyspace.PAUSE, audit.signed("pause", self.pause))
         rpc.register(keyspace.RESUME, audit.signed("resume", self.resume))
         rpc.register(keyspace.RETRY, audit.signed("retry", self.retry))
+        rpc.register(keyspace.FIRST, audit.signed("first", self.first))
         rpc.register(keyspace.ACTS, audit.acts)
 
     async def approve(self, ask: ApproveAsk) -> TaskRecord:
@@ -407,6 +409,10 @@ class OperatorVerbs:
     async def retry(self, ask: RetryAsk) -> TaskRecord:
         """Answer `retry`. Errors as `deciding.may_retry`."""
         return await self._steer(keyspace.RETRY, ask)
+
+    async def first(self, ask: FirstAsk) -> TaskRecord:
+        """Answer `first`. Errors as `deciding.may_move` and `turns.moved_before`."""
+        return await self._steer(keyspace.FIRST, ask)
 
     async def _steer(self, verb: Verb[A, TaskRecord], ask: A) -> TaskRecord:
         if ask.here or ask.id in self._coordinators:
@@ -475,3 +481,5 @@ def is_wanted(record: TaskRecord, ask: Ask) -> bool:
             return may_resume(record, ask)
         case RetryAsk():
             return may_retry(record, ask)
+        case FirstAsk():
+            return may_move(record, ask)

@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from appliance.errors import SwiftbotError
 from appliance.model import Failure, Plan, RunEvent, RunRequest, SubtaskRecord, TaskRecord, Word
-from appliance.model.task_api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk, RunStatus
+from appliance.model.task_api import ApproveAsk, FirstAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk, RunStatus
 from appliance.tasks.placement import PlacementCase
 
 
@@ -72,7 +72,7 @@ class CancelAsked(Struct, frozen=True):
 class OperatorAsked(Struct, frozen=True, kw_only=True):
     """An operator's order; `outcome` gets the record when it is written with what followed, or the refusal."""
 
-    ask: ApproveAsk | RejectAsk | PauseAsk | ResumeAsk | RetryAsk
+    ask: ApproveAsk | RejectAsk | PauseAsk | ResumeAsk | RetryAsk | FirstAsk
     outcome: "asyncio.Future[TaskRecord]"
 
 

@@ -32,6 +32,7 @@ which is checked here against what the record holds:
   gives a plan by its hash, which may be cut short.
 - `paused` keeps subtasks from being started; `resumed` takes that back. A task may be paused for several reasons, an
   operator's wish and a soft stop of a robot, and goes on when the last has gone.
+- `ranked` changes its priority and its place among the tasks that wait for the same robot.
 - `held` leaves a run for a later attempt: its number fences late news of it off, and it counts for no failure.
 - `retried` begins a task that has failed or was cancelled again, or one of its subtasks: what has succeeded is kept,
   and attempts count on from where they were.
@@ -339,6 +340,11 @@ def resumed(record: TaskRecord, event: Transition) -> TaskRecord:
     return _noted(changed, changed.paused)
 
 
+def ranked(record: TaskRecord, event: Transition) -> TaskRecord:
+    """Change its place among those that wait for the same robot."""
+    return replace(record, priority=event.priority, place_ns=event.place_ns, ranked_by=event.word)
+
+
 def held(record: TaskRecord, event: Transition) -> TaskRecord:
     """Leave a run; its subtask is ready for the next attempt."""
     target = _of(record, event.subtask)
@@ -431,6 +437,7 @@ HANDLERS: dict[TransitionKind, Callable[[TaskRecord, Transition], TaskRecord]] =
     TransitionKind.RESUMED: resumed,
     TransitionKind.HELD: held,
     TransitionKind.RETRIED: retried,
+    TransitionKind.RANKED: ranked,
 }
 """By kind; `proposed` takes the place of the one in `revising`, which it calls."""
 

@@ -11,9 +11,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 
 import structlog
+from msgspec.structs import replace
 
 from appliance.background import Background
 from appliance.errors import NotFoundError, SwiftbotError
+from appliance.llm.checks.schema import is_unnamed
 from appliance.model import (
     GatewayStatus,
     Group,
@@ -25,7 +27,7 @@ from appliance.model import (
     TaskRecord,
     keyspace,
 )
-from appliance.model.gateways import MOST_WORK
+from appliance.model.gateways import MOST_WORK, queues
 from appliance.model.task_api import SkillList, SkillsAsk
 from appliance.plane.node import Plane
 from appliance.skills.catalogue import Catalogue
@@ -56,6 +58,7 @@ from appliance.tasks.placement import (
 )
 from appliance.tasks.records import task_key
 from appliance.tasks.settings import TasksConfig
+from appliance.tasks.turns import goes_first, work_of
 
 log = structlog.get_logger(__name__)
 
@@ -110,6 +113,12 @@ class Scheduler:
         self._costs: dict[tuple[str, tuple[str, ...], str, float], Cost] = {}
         """Task, subtasks, robot, work it has to do first -> what they would cost it, reckoned since `_costs_at`."""
         self._costs_at = -math.inf
+        self._work: dict[str, tuple[TaskRecord, list[RobotWork]]] = {}
+        """Task -> what it has for robots, by its record as it was then."""
+        self._blocked: dict[str, set[str]] = {}
+        """Task -> subtasks that wait for something else than their turn at a robot."""
+        self._wanted: dict[str, dict[str, str]] = {}
+        """Task -> label -> the robot that it would take, whose turn it is not."""
         self._looked: dict[str, float] = {}
         """Task -> when its group was last looked at as a whole."""
         self._skills: dict[str, frozenset[str]] = {}
@@ -133,6 +142,33 @@ class Scheduler:
 
     def bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[tuple[str, ...], str]:
         """Choose the robots of a subtask, its own first; none of them with the reason for the wait."""
+        robots, why = self._bind(record, target)
+        blocked = self._blocked.setdefault(record.id, set())
+        if bool(robots) == (target.subtask.id in blocked):
+            blocked ^= {target.subtask.id}
+            self._work.pop(record.id, None)
+        return robots, why
+
+    def goes_first(self, record: TaskRecord, target: SubtaskRecord, robots: Sequence[str]) -> str:
+        """Why a subtask waits although its robots are there: it is another task's turn, in words; "" when it is not."""
+        wanted = self._wanted.setdefault(record.id, {})
+        found = dict(zip(target.subtask.robots, robots, strict=False))
+        if wanted | found != wanted:
+            wanted |= found
+            self._work.pop(record.id, None)
+        uses = self._uses(target.subtask)
+        for mine in self._rows(record):
+            if mine.robot in robots:
+                first = goes_first(replace(mine, uses=uses), self.fleet_work())
+                if first is not None:
+                    return f"waits for {mine.robot}: task {first.task} goes first"
+        return ""
+
+    def _uses(self, subtask: Subtask) -> tuple[str, ...]:
+        manifest = self._catalogue.skills.get(subtask.skill)
+        return tuple(manifest.uses) if manifest is not None else ()
+
+    def _bind(self, record: TaskRecord, target: SubtaskRecord) -> tuple[tuple[str, ...], str]:
         if why := self._closed(target.subtask):
             return (), f"waits: {why}"
         skills = self._catalogue.skills
@@ -184,19 +220,29 @@ class Scheduler:
 
     def work(self) -> tuple[RobotWork, ...]:
         """Return what the tasks that this gateway coordinates have for robots."""
-        takes: dict[tuple[str, str], float] = {}
-        for record in self._records():
-            for each in record.subtasks:
-                for robot in each.robots:
-                    if robot in self._plane.registry.robots and not each.state.final and not record.state.final:
-                        key, takes_s = (robot, record.id), seconds_of(self._expected(each.subtask.skill, robot))
-                        takes[key] = takes.get(key, 0.0) + takes_s
-        found = (RobotWork(robot=robot, task=task, takes_s=round(takes_s)) for (robot, task), takes_s in takes.items())
-        return tuple(found)[:MOST_WORK]
+        found = [each for record in self._records() for each in self._rows(record)]
+        return tuple(sorted(found, key=lambda each: each.rank)[:MOST_WORK])
+
+    def _rows(self, record: TaskRecord) -> list[RobotWork]:
+        """Return what a task has for robots; worked out once for each version of its record."""
+        known = self._work.get(record.id)
+        if known is None or known[0] is not record:
+            wanted = self._wanted.get(record.id, {})
+            found = work_of(
+                record,
+                robots_of=lambda each: [
+                    name for label in each.robots if not is_unnamed(name := wanted.get(label, label))
+                ],
+                takes_s=lambda each, robot: seconds_of(self._expected(each.skill, robot)),
+                uses=self._uses,
+                blocked=self._blocked.get(record.id, set()).__contains__,
+            )
+            known = self._work[record.id] = (record, found)
+        return known[1]
 
     def fleet_work(self) -> Iterable[RobotWork]:
         """Return the same of the whole fleet, of each task once: while one changes hands two gateways tell it."""
-        found = {(each.robot, each.task): each for status in self.gateways().values() for each in status.work}
+        found = {(each.robot, each.task): each for each in queues(self.gateways().values())}
         return (found | {(each.robot, each.task): each for each in self.work()}).values()
 
     def busy_robots(self) -> frozenset[str]:
@@ -396,6 +442,8 @@ class Scheduler:
     def forget(self, task: str) -> None:
         """Note that a task is not driven here any more."""
         self.line.forget(task, time.monotonic())
+        for kept in (self._work, self._blocked, self._wanted):
+            kept.pop(task, None)
         self._looked.pop(task, None)
 
 

@@ -26,7 +26,7 @@ from appliance.model import (
     TaskState,
     Word,
 )
-from appliance.model.task_api import ApproveAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
+from appliance.model.task_api import ApproveAsk, FirstAsk, PauseAsk, RejectAsk, ResumeAsk, RetryAsk
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.machine import ACTIVE, SHORTEST, matches
 from appliance.tasks.records import refuse_trimmed
@@ -137,6 +137,21 @@ def may_resume(record: TaskRecord, ask: ResumeAsk) -> bool:
     return False
 
 
+def may_move(record: TaskRecord, ask: FirstAsk) -> bool:
+    """Whether a task is to be put before others; False when this very order was carried out.
+
+    Raises:
+        RefusedError: it has ended, or is to go before itself.
+    """
+    if ask.act and record.ranked_by is not None and record.ranked_by.act == ask.act:
+        return False
+    if record.state.final or record.state is TaskState.CANCELLING:
+        raise RefusedError(f"task {record.id} is {record.state}: it waits for no robot")
+    if ask.before == record.id:
+        raise RefusedError(f"task {record.id} cannot go before itself", remedy="name another task, or none")
+    return True
+
+
 def may_retry(record: TaskRecord, ask: RetryAsk) -> bool:
     """Whether something is to be tried again; False when this very order was carried out.
 
@@ -196,6 +211,6 @@ def revived(record: TaskRecord, ask: RetryAsk, *, elapsed_s: float) -> dict[str,
     }
 
 
-def word_of(ask: RejectAsk | RetryAsk) -> Word:
+def word_of(ask: RejectAsk | RetryAsk | FirstAsk) -> Word:
     """Return who gives an order, and why, as a record keeps it."""
     return Word(by=ask.by, why=ask.why, act=ask.act, at_ns=time.time_ns())

@@ -22,6 +22,7 @@ from textual.widget import Widget
 
 from appliance.errors import SwiftbotError
 from appliance.model import Enquiry, Lease, Pose, RobotInfo, Site, SubtaskState, TaskRecord
+from appliance.model import gateways as facts
 from appliance.tui.formatting import Cell, hanging
 from appliance.tui.safe import safe
 from appliance.tui.store import Gateway, Store
@@ -87,6 +88,17 @@ class Robot(Struct, frozen=True, kw_only=True):
     """Who has taken it over."""
     questions: tuple[Enquiry, ...] = ()
     """What it, or a skill about it, asks people."""
+    queue: tuple[str, ...] = ()
+    """The tasks that have something for it, in order, with what each waits for."""
+
+
+def queues_of(gateways: Iterable[Gateway]) -> dict[str, tuple[str, ...]]:
+    """Return the tasks that have something for robots, in order, by robot."""
+    found: dict[str, tuple[str, ...]] = {}
+    for each in facts.queues(gateway.status for gateway in gateways if not gateway.lost_ns):
+        waits = " (waits)" if each.state == "ready" else " (later)" if each.state == "later" else ""
+        found[each.robot] = (*found.get(each.robot, ()), f"{each.task}{waits}")
+    return found
 
 
 def missions(record: TaskRecord) -> dict[str, str]:
@@ -231,6 +243,7 @@ def about(robot: Robot, width: int = 0) -> Text:
         ("battery", charge, charge_style),
         ("position", f"{place(pose)} m east, north, up{heading}" if pose is not None else "not told", ""),
         ("mission", safe(robot.mission or "none", 120), ""),
+        ("queue", safe(", ".join(robot.queue) or "empty", 300), ""),
         ("holds", f"{safe(info.holding or 'nothing', 120)}{_ways_to_free(robot)}", ""),
         ("has", safe(", ".join(info.uses) or "not told", 200), ""),
         ("answers", safe(", ".join(info.verbs) or "not told", 300), ""),
@@ -310,6 +323,7 @@ class KnownRobots:
         self._doing: dict[str, dict[str, str]] = {}
         """Robot -> task -> what it does for it; the task that began last stands last."""
         self._leases: dict[str, Lease] = {}
+        self._queues: dict[str, tuple[str, ...]] = {}
         self._questions: dict[str, tuple[Enquiry, ...]] = {}
 
     def of(self, store: Store) -> dict[str, Robot]:
@@ -335,6 +349,7 @@ class KnownRobots:
                 maintenance=kept_out.get(name, ""),
                 lease=self._leases.get(name),
                 questions=self._questions.get(name, ()),
+                queue=self._queues.get(name, ()),
             )
             if rows.get(name) != fresh:
                 rows[name] = fresh
@@ -377,6 +392,9 @@ class KnownRobots:
             leases = leases_of(store.gateways.values())
             stale |= {robot for robot in leases.keys() | self._leases if leases.get(robot) != self._leases.get(robot)}
             self._leases = leases
+            queues = queues_of(store.gateways.values())
+            stale |= {robot for robot in queues.keys() | self._queues if queues.get(robot) != self._queues.get(robot)}
+            self._queues = queues
         if self._seen[1] != enquiries:
             asked = questions_of(store.enquiries.values())
             stale |= {

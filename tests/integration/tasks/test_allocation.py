@@ -11,11 +11,13 @@ from fleets import PLAIN, fleet_in
 from msgspec.structs import replace
 
 from appliance.client import FleetClient
+from appliance.errors import RefusedError
 from appliance.llm.settings import SafetyConfig
-from appliance.model import TaskRequest, TaskState
+from appliance.model import RobotWork, TaskRequest, TaskState
+from appliance.model.gateways import queues
 from appliance.pool.settings import PoolConfig
 from appliance.tasks.settings import BatteryConfig, TasksConfig
-from tests.integration.tasks.test_floor import RADIUS_M, Distances
+from tests.integration.tasks.test_floor import RADIUS_M, Distances, until_ended
 from tests.integration.tasks.test_partition import process
 
 pytestmark = [pytest.mark.anyio, pytest.mark.podman]
@@ -80,6 +82,39 @@ async def test_the_nearer_robot_with_low_charge_is_not_taken(client: FleetClient
     assert proposal.waits
     assert low in proposal.note
     await client.cancel("t-named")
+
+
+async def test_tasks_of_one_robot_go_one_after_another_and_are_put_in_another_order(tmp_path: Path) -> None:
+    """A task that has begun goes on to its end; the others wait and say for whom; one is put before another."""
+    async with rovers(tmp_path, rate=4, battery=BatteryConfig(), rover_1=("dock 2", 90)) as client:
+        orders = {"t-1": "go to dock 1, then go to dock 4", "t-2": "go to dock 2", "t-3": "go to dock 3"}
+        for task, words in orders.items():
+            await client.submit(TaskRequest(instruction=f"rover_1: {words}", id=task))
+            async with asyncio.timeout(LONG_S):
+                while task not in {each.task for each in queue_of(client)}:
+                    await asyncio.sleep(0.05)
+        async with asyncio.timeout(LONG_S):
+            while [each.task for each in queue_of(client)] != ["t-1", "t-2", "t-3"]:
+                await asyncio.sleep(0.05)
+        why = await client.why("t-3")
+        assert "waits for rover_1: task t-1 goes first" in why.subtasks[0].note
+        await client.first("t-3", before="t-2", why="it is urgent")
+        async with asyncio.timeout(LONG_S):
+            while [each.task for each in queue_of(client)] != ["t-1", "t-3", "t-2"]:
+                await asyncio.sleep(0.05)
+        with pytest.raises(RefusedError, match="does not wait for a robot"):
+            await client.first("t-3", before="t-none")
+        await until_ended(client, "t-1", "t-2", "t-3")
+        records = [await client.task(each) for each in ("t-1", "t-3", "t-2")]
+        assert {each.state for each in records} == {TaskState.SUCCEEDED}
+        ends = [each.updated_ns for each in records]
+        assert ends == sorted(ends)
+        assert queue_of(client) == []
+
+
+def queue_of(client: FleetClient) -> list[RobotWork]:
+    """Return what tasks have for robots, in order."""
+    return queues(client.plane.registry.gateways.values())
 
 
 async def test_robots_charge_by_themselves_one_after_the_other(tmp_path: Path) -> None:

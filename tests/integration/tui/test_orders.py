@@ -166,6 +166,27 @@ async def test_pause_hold_and_resume(ann: Operator, client: FleetClient) -> None
     await client.cancel("t-hold")
 
 
+@does("first")
+async def test_a_task_is_put_before_others(ann: Operator, client: FleetClient) -> None:
+    """By its key, among those that wait for one robot; the record says who has done it."""
+    orders = {
+        "t-far": "go to dock 4, then go to dock 1, then go to dock 4",
+        "t-a": "go to dock 2",
+        "t-b": "go to dock 3",
+    }
+    for task, words in orders.items():
+        await client.submit(TaskRequest(instruction=f"rover_1: {words}", id=task))
+    await record_of(client, "t-b", lambda record: record.subtasks)
+    await select(ann, "t-b")
+    await ann.press("u")
+    record = await record_of(client, "t-b", lambda record: record.ranked_by)
+    assert record.ranked_by is not None
+    assert record.ranked_by.by == "ann"
+    assert 0 < record.place_ns < record.created_ns
+    for task in orders:
+        await client.cancel(task)
+
+
 @does("cancel", "retry", "retry-subtask")
 async def test_cancel_and_retry(ann: Operator, client: FleetClient) -> None:
     """A cancelled task ends with who asked for it; tried again, whole or one subtask of it, it runs again."""

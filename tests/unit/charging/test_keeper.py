@@ -92,7 +92,7 @@ async def test_nobody_is_sent_who_is_stopped_or_busy_or_where_the_charger_is_clo
     """And only the owner of the key sends anybody."""
     fleet.stopped = "stopped by ann"
     await fleet.charging.look()
-    fleet.stopped, fleet.work = "", [RobotWork(robot="rover_1", task="t-1")]
+    fleet.stopped, fleet.work = "", [RobotWork(robot="rover_1", task="t-1", state="ready")]
     await fleet.charging.look()
     fleet.work, fleet.closed = [], {"charger"}
     await fleet.charging.look()

@@ -2,11 +2,22 @@
 """What a coordinator decides with: facts, placement, the decomposer, and runs that the test orders."""
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from appliance.errors import NotFoundError, PlanError
-from appliance.model import Choice, Group, Phase, Plan, RobotInfo, RunAccepted, RunRequest, SubtaskRecord, TaskRecord
+from appliance.model import (
+    Choice,
+    Group,
+    Phase,
+    Plan,
+    RobotInfo,
+    RobotWork,
+    RunAccepted,
+    RunRequest,
+    SubtaskRecord,
+    TaskRecord,
+)
 from appliance.skills.catalogue import SkillManifest
 from appliance.tasks.context import FREE
 from appliance.tasks.machine import Transition
@@ -35,6 +46,8 @@ class FakeContext:
         self.passed_to = ""
         self.groups: list[Group] = []
         self.room = True
+        self.others_first = ""
+        self.work: list[RobotWork] = []
         self.left_s: list[float] = []
         self.expected = ""
         self.moved: list[tuple[tuple[str, ...], dict[str, float]]] = []
@@ -124,6 +137,14 @@ class FakeContext:
         """Return the robot, and those that the plan names beside it."""
         robot, reason = self.robot
         return (() if robot is None else (robot, *target.subtask.robots[1:])), reason
+
+    def goes_first(self, record: TaskRecord, target: SubtaskRecord, robots: Sequence[str]) -> str:
+        """Return what the test says."""
+        return self.others_first
+
+    def fleet_work(self) -> list[RobotWork]:
+        """Return what the test says."""
+        return self.work
 
     def place(self, record: TaskRecord, target: SubtaskRecord, robot: str | None) -> Placement:
         """Gateways in order, those where it failed last."""

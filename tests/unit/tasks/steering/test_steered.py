@@ -11,6 +11,7 @@ from appliance.errors import ConflictError, NotFoundError, PlanError, RefusedErr
 from appliance.model import (
     Failure,
     Provenance,
+    RobotWork,
     RunEventKind,
     SoftStop,
     Subtask,
@@ -20,7 +21,17 @@ from appliance.model import (
     Tier,
     encode,
 )
-from appliance.model.task_api import ApproveAsk, Held, PauseAsk, RejectAsk, ResumeAsk, RetryAsk, RunAsk, RunStatus
+from appliance.model.task_api import (
+    ApproveAsk,
+    FirstAsk,
+    Held,
+    PauseAsk,
+    RejectAsk,
+    ResumeAsk,
+    RetryAsk,
+    RunAsk,
+    RunStatus,
+)
 from appliance.tasks import machine
 from appliance.tasks.events import CancelAsked, Wake
 from appliance.tasks.machine import plan_hash
@@ -204,6 +215,31 @@ async def test_a_paused_task_starts_nothing_and_goes_on_when_resumed(bench: Any)
     await bench.order(ResumeAsk(id="t-1", by="bob"))
     _, request = await bench.ordered()
     assert request.subtask == "s2"
+    assert same(fold(bench), bench.coordinator.written)
+
+
+async def test_a_task_waits_for_its_turn_at_a_robot_and_is_put_before_another(bench: Any) -> None:
+    """It is not given to another robot meanwhile; the order is in the record, and carried out once."""
+    bench.context.the_plan = bench.plan_of(*ON_ROBOT)
+    bench.context.others_first = "waits for r1: task t-0 goes first"
+    row = RobotWork(robot="r1", task="t-0", state="ready", priority=7, place_ns=50, uses=("base",))
+    bench.context.work = [row, replace(row, task="t-1", priority=5)]
+    await bench.start()
+    await bench.until(lambda record: record.subtasks and record.of("s1").note == bench.context.others_first)
+    assert bench.context.orders.empty()
+    for _ in range(2):
+        record = await bench.order(FirstAsk(id="t-1", by="ann", why="urgent", before="t-0", act="f"))
+        assert record.priority == 7
+        assert record.place_ns < 50
+        assert (record.ranked_by.by, record.ranked_by.why) == ("ann", "urgent")
+    with pytest.raises(RefusedError, match="cannot go before itself"):
+        await bench.order(FirstAsk(id="t-1", before="t-1"))
+    with pytest.raises(RefusedError, match="t-9 does not wait for a robot of task t-1"):
+        await bench.order(FirstAsk(id="t-1", before="t-9"))
+    bench.context.others_first = ""
+    bench.say(Wake())
+    _, request = await bench.ordered()
+    assert request.robot == "r1"
     assert same(fold(bench), bench.coordinator.written)
 
 
