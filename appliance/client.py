@@ -53,7 +53,7 @@ from appliance.model import (
     keyspace,
 )
 from appliance.model.alerts import MOST_ACKED, Alert, AlertAck, AlertList, AlertsAcked, AlertsAsk
-from appliance.model.closures import CloseAsk, Closure, ClosureList, ClosuresAsk, ReopenAsk
+from appliance.model.closures import CloseAsk, Closure, ClosureList, ClosuresAsk, ReopenAsk, Rule
 from appliance.model.learn_api import (
     LearnEvalAsk,
     LearnEvaluated,
@@ -287,7 +287,7 @@ class SteeringCalls(FleetConnection):
         acts = {each.id: each for answer in found.values() for each in answer.acts}
         return tuple(sorted(acts.values(), key=lambda each: each.at_ns, reverse=True)[:limit]), failed
 
-    # --- places and robots out of use -----------------------------------------------------------------------------
+    # --- places and robots out of use, standing rules ---------------------------------------------------------------
 
     async def close_place(self, name: str, *, until_ns: int = 0, why: str = "") -> Closure:
         """Close a place: no task goes there until it is opened, or until a moment, Unix nanoseconds."""
@@ -297,12 +297,17 @@ class SteeringCalls(FleetConnection):
         """Take a robot into maintenance: tasks command it no more; an operator who takes it over does."""
         return await self._ask(keyspace.CLOSE, CloseAsk(kind="robot", name=robot, until_ns=until_ns, **self._sign(why)))
 
-    async def reopen(self, kind: Literal["place", "robot"], name: str, *, why: str = "") -> Closure:
-        """Open a place, or end a robot's maintenance; NotFoundError where it is not out of use."""
+    async def add_rule(self, rule: Rule, *, until_ns: int = 0, why: str = "") -> Closure:
+        """Add a standing rule, or change until when and why; it is returned as the fleet keeps it."""
+        ask = CloseAsk(kind="rule", name=rule.id, rule=rule, until_ns=until_ns, **self._sign(why))
+        return await self._ask(keyspace.CLOSE, ask)
+
+    async def reopen(self, kind: Literal["place", "robot", "rule"], name: str, *, why: str = "") -> Closure:
+        """Open a place, end a robot's maintenance, or remove a rule by its id; NotFoundError where there is none."""
         return await self._ask(keyspace.REOPEN, ReopenAsk(kind=kind, name=name, **self._sign(why)))
 
     async def closures(self) -> ClosureList:
-        """Places and robots that are out of use, as any one gateway knows them."""
+        """Places and robots that are out of use, and standing rules, as any one gateway knows them."""
         return await self._ask(keyspace.CLOSURES, ClosuresAsk())
 
     # --- schedules and saved instructions -------------------------------------------------------------------------

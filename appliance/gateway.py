@@ -571,7 +571,8 @@ class Gateway:
         self._stack.push_async_callback(self.floor.close)
 
     def _out_of_use(self) -> OutOfUse:
-        return OutOfUse(places=self.closures.places, robots=self.closures.robots)
+        kept = self.closures
+        return OutOfUse(places=kept.places, robots=kept.robots, rules=kept.rules)
 
     def _keep_alerts(self, audit: Audit) -> None:
         if self.config.alerts.urls_file:

@@ -1013,6 +1013,20 @@ async def end_maintenance(client: FleetClient, robot: RobotId, *, why: Why = "")
     return Outcome(value=found, text=f"{found.name} is in use again; it was {found.text}")
 
 
+RuleId = Annotated[str, Kind("rule", "Rule ID, as `swiftbot rules list` shows it.")]
+
+
+@operation(
+    "rules remove", name="remove-rule", title="Remove rule", keys=("R",), screens=("schedules",), role=Role.OPERATOR,
+    danger="Remove standing rule {rule}? Tasks that wait for it continue, and new plans may do what it forbids.",
+    audit="rule_remove", footer=False,
+)  # fmt: skip
+async def remove_rule(client: FleetClient, rule: RuleId, *, why: Why = "") -> Outcome:
+    """Remove a standing rule: tasks that wait for it continue."""
+    found = await client.reopen("rule", rule, why=why)
+    return Outcome(value=found, text=f"removed {found.name}: {found.text}")
+
+
 def until_and_why(text: str) -> tuple[int, str]:
     """Return the moment that a reason begins with, Unix nanoseconds or 0 for none, and the reason without it."""
     first, _, rest = text.strip().partition(" ")

@@ -189,7 +189,7 @@ class Tools:
         """Show the site: places with positions in metres, objects, limits, and what is closed."""
         client = await self._open()
         site, closed = await client.site(), await client.closures()
-        return answer({"site": site, "closed": closed.closures})
+        return answer({"site": site, "closed": closed.closures, "rules": closed.rules})
 
     @_tool
     async def plan(self, instruction: Instruction) -> CallToolResult:

@@ -1,4 +1,4 @@
-"""Places that are closed and robots in maintenance: kept by the fleet, known on every gateway without asking.
+"""Places that are closed, robots in maintenance, standing rules: kept by the fleet, known on every gateway.
 
 Doors: `keeper.Closures`, `keeper.resolve`.
 """

@@ -10,6 +10,7 @@ import random
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import msgspec
 import structlog
@@ -17,7 +18,7 @@ from msgspec.structs import replace
 
 from appliance.errors import ConflictError, NotFoundError, PayloadError, RefusedError, SwiftbotError
 from appliance.model import Site, Word, encode, keyspace
-from appliance.model.closures import CloseAsk, Closure, ClosureList, ClosuresAsk, ReopenAsk, closure_id
+from appliance.model.closures import CloseAsk, Closure, ClosureList, ClosuresAsk, ReopenAsk, Rule, closure_id
 from appliance.plane.dht import Record
 from appliance.plane.events import AuthorityChanged, FleetEvent, Joined, RingChanged, Stage
 from appliance.plane.node import Plane
@@ -99,6 +100,12 @@ class Closures:
         """Robots in maintenance, and why."""
         return self._of("robot")
 
+    @property
+    def rules(self) -> tuple[Closure, ...]:
+        """Standing rules that hold now."""
+        now_ns = self._now_ns()
+        return tuple(each for each in self._kept.values() if each.kind == "rule" and each.in_force(now_ns))
+
     def robot(self, name: str) -> str:
         """Why a robot is out of use; empty when it is not."""
         found = self._kept.get(closure_id("robot", name))
@@ -133,7 +140,7 @@ class Closures:
     def _look(self) -> None:
         """Tell the parts of this gateway when what is in force has changed."""
         now_ns = self._now_ns()
-        in_force = frozenset(name for name, each in self._kept.items() if each.holds(now_ns))
+        in_force = frozenset(name for name, each in self._kept.items() if each.in_force(now_ns))
         if in_force != self._in_force:
             self._in_force = in_force
             self._plane.events.publish(AuthorityChanged())
@@ -196,9 +203,10 @@ class Closures:
     async def _ask(self, member: str) -> tuple[Closure, ...] | None:
         try:
             ask = ClosuresAsk(local=True)
-            return (await self._plane.rpc.call(member, keyspace.CLOSURES, ask, timeout_s=ANSWER_S)).closures
+            answer = await self._plane.rpc.call(member, keyspace.CLOSURES, ask, timeout_s=ANSWER_S)
         except SwiftbotError:
             return None
+        return (*answer.closures, *answer.rules)
 
     async def _shard(self) -> list[Closure]:
         """Return the closures whose records this gateway owns."""
@@ -227,24 +235,27 @@ class Closures:
         """Answer `closures`."""
         now_ns = self._now_ns()
         found: Iterable[Closure] = await self._shard() if ask.local else self._kept.values()
+        kept = sorted((each for each in found if each.holds(now_ns)), key=lambda each: each.id)
         return ClosureList(
-            closures=tuple(sorted((each for each in found if each.holds(now_ns)), key=lambda each: each.id))
+            closures=tuple(each for each in kept if each.kind != "rule"),
+            rules=tuple(each for each in kept if each.kind == "rule"),
         )
 
     async def close_ask(self, ask: CloseAsk) -> Closure:
-        """Answer `close`: take a place or robot out of use; what is closed already is closed as asked now.
+        """Answer `close`: take a place or robot out of use, or add a rule; what is there already is as asked now.
 
         Raises:
             NotFoundError: there is no such place or robot.
-            PayloadError: the time is over.
+            PayloadError: the time is over, or it is no rule.
         """
         now_ns = self._now_ns()
         if 0 < ask.until_ns <= now_ns:
             raise PayloadError("the time until which it is out of use is over", remedy="give one that is to come")
-        name = self._named(ask)
+        rule = self._ruled(ask)
+        name = self._named(ask) if rule is None else rule.id
         name_id = closure_id(ask.kind, name)
         if name_id not in self._kept and len(self._kept) >= MOST:
-            raise RefusedError(f"{MOST} places and robots are out of use already", remedy="open some of them")
+            raise RefusedError(f"{MOST} closures and rules are kept already", remedy="open or remove some of them")
         key = keyspace.CLOSURE_RECORD.key(name_id)
         for _ in range(TRIES):
             stored = await self._plane.dht.read(key)
@@ -253,7 +264,7 @@ class Closures:
                 (each.by.at_ns + 1 for each in (_decoded(stored), self._kept.get(name_id)) if each), default=0
             )
             word = Word(by=ask.by or "unsigned", why=ask.why, act=ask.act, at_ns=max(now_ns, after_ns))
-            closure = Closure(kind=ask.kind, name=name, by=word, until_ns=ask.until_ns)
+            closure = Closure(kind=ask.kind, name=name, by=word, rule=rule, until_ns=ask.until_ns)
             try:
                 await self._plane.dht.write(
                     key, encode(closure), expected=stored.version if stored is not None else None
@@ -275,10 +286,8 @@ class Closures:
             stored = await self._plane.dht.read(key)
             known = _decoded(stored)
             if stored is None or known is None or not known.holds(self._now_ns()):
-                state = "closed" if ask.kind == "place" else "in maintenance"
-                raise NotFoundError(
-                    f"{ask.name[:80]} is not {state}", remedy="`swiftbot place list`, `swiftbot robots`"
-                )
+                state, lists = _STATES[ask.kind]
+                raise NotFoundError(f"{ask.name[:80]} is not {state}", remedy=f"`{lists}` lists what is")
             try:
                 await self._plane.dht.remove(key, expected=stored.version)
             except ConflictError:
@@ -297,20 +306,51 @@ class Closures:
         return next((key for key, each in self._site.places.items() if each is place), name)
 
     def _named(self, ask: CloseAsk) -> str:
-        if ask.kind == "robot":
-            if ask.name not in self._plane.registry.robots:
-                raise NotFoundError(f"unknown robot {ask.name[:80]!r}", remedy="`swiftbot robots` lists them")
-            return ask.name
-        name = self._canonical("place", ask.name)
-        if name not in self._site.places:
-            known = ", ".join(sorted(self._site.places)[:12]) or "none"
-            raise NotFoundError(f"no place {ask.name[:80]!r} on the site", remedy=f"places: {known}")
+        return self._robot(ask.name) if ask.kind == "robot" else self._place(ask.name)
+
+    def _robot(self, name: str) -> str:
+        if name not in self._plane.registry.robots:
+            raise NotFoundError(f"unknown robot {name[:80]!r}", remedy="`swiftbot robots` lists them")
         return name
 
+    def _place(self, asked: str) -> str:
+        name = self._canonical("place", asked)
+        if name not in self._site.places:
+            known = ", ".join(sorted(self._site.places)[:12]) or "none"
+            raise NotFoundError(f"no place {asked[:80]!r} on the site", remedy=f"places: {known}")
+        return name
 
-_CLOSING = {"place": "place_close", "robot": "robot_maintain"}
-_OPENING = {"place": "place_open", "robot": "robot_maintain_end"}
+    def _ruled(self, ask: CloseAsk) -> Rule | None:
+        """Return the rule that is asked for, in the one form that it has however it is written."""
+        if (ask.kind == "rule") != (ask.rule is not None):
+            raise PayloadError("a rule is asked for by what it says", remedy="swiftbot rules add --help")
+        if ask.rule is None:
+            return None
+        rule = ask.rule
+        try:
+            ZoneInfo(rule.zone)
+        except (OSError, ValueError, KeyError) as error:
+            remedy = "give an IANA name, such as Europe/Zurich or UTC"
+            raise PayloadError(f"no time zone {rule.zone[:60]!r}", remedy=remedy) from error
+        return replace(
+            rule,
+            robots=tuple(sorted({self._robot(each) for each in rule.robots})),
+            group="all" if rule.robots else rule.group,
+            places=tuple(sorted({self._place(each) for each in rule.places})),
+            things=tuple(sorted({" ".join(each.casefold().split()) for each in rule.things})),
+            days=tuple(sorted(set(rule.days))),
+            zone=rule.zone if rule.timed else "UTC",
+        )
+
+
+_CLOSING = {"place": "place_close", "robot": "robot_maintain", "rule": "rule_add"}
+_OPENING = {"place": "place_open", "robot": "robot_maintain_end", "rule": "rule_remove"}
 """Verbs of the audit."""
+_STATES = {
+    "place": ("closed", "swiftbot place list"),
+    "robot": ("in maintenance", "swiftbot robots"),
+    "rule": ("a standing rule", "swiftbot rules list"),
+}
 
 
 def _decoded(stored: Record | None) -> Closure | None:

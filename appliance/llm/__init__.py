@@ -2,7 +2,8 @@
 
 Doors: `cascade.Decomposer` with `peers.PeerTier`; `settings`; `stop_words` with `preprocessing.stop_refused`;
 `training_words` with `preprocessing.training_refused`; `checks.schema` (whether a plan can be run at all),
-`checks.safety.strictest` and `checks.safety.out_of_use`; `batch` (many instructions of a file).
+`checks.safety.strictest`, `checks.safety.out_of_use`, `checks.safety.kept_from` and `checks.safety.involved`; `batch`
+(many instructions of a file).
 
 Way of an instruction: `preprocessing` -> `plan_cache` -> `tiers` in order, as `routing` allows ->
 `completion` -> `review` by `checks`; `feedback` keeps what became of the plans. Tiers keep the contract in `tier`:

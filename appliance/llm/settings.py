@@ -18,6 +18,7 @@ from msgspec import Meta, Struct
 
 from appliance.errors import ConfigError
 from appliance.model import Plan, RobotInfo, Site, SubtaskState, TaskRecord, TierAttempt
+from appliance.model.closures import Closure
 
 EMBEDDED = "embedded"
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -282,10 +283,12 @@ class LlmConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class OutOfUse(Struct, frozen=True, kw_only=True):
-    """What operators have taken out of use: by name, why and until when in words."""
+    """What operators have taken out of use, by name, with why and until when in words; standing rules."""
 
     places: Mapping[str, str] = {}
     robots: Mapping[str, str] = {}
+    rules: tuple[Closure, ...] = ()
+    """Those that hold now."""
 
 
 class PlanContext(Struct, frozen=True, kw_only=True):
@@ -304,7 +307,7 @@ class PlanContext(Struct, frozen=True, kw_only=True):
     from_robot: bool = False
     """Whether that is a robot, whom the safety policy may allow less."""
     out_of_use: OutOfUse = OutOfUse()
-    """Places that are closed, and robots in maintenance."""
+    """Places that are closed, robots in maintenance, and standing rules."""
 
 
 class PlanOutcome(Struct, frozen=True, kw_only=True):

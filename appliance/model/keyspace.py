@@ -451,8 +451,8 @@ ALERT = Topic(
 CLOSURE = Topic(
     "operator/closure/{closure}",
     Closure,
-    "Closure `{kind, name, by, until_ns, ended_ns}`: a place that is closed or a robot in maintenance; with `ended_ns` "
-    "it is over",
+    "Closure `{kind, name, by, rule, until_ns, ended_ns}`: a closed place, a robot in maintenance or a standing rule; "
+    "with `ended_ns` it is over",
     writer="the gateway that an operator asks; the record's owner when its time is over",
     often="when it begins, changes, is over",
     kept="the closure itself is in the DHT",
@@ -1035,7 +1035,7 @@ CLOSE = Verb(
     "close",
     closures.CloseAsk,
     Closure,
-    "close a place or take a robot into maintenance, or change until when",
+    "close a place, take a robot into maintenance or add a standing rule, or change until when",
     asks=STEERING,
     signed=True,
 )
@@ -1043,7 +1043,7 @@ REOPEN = Verb(
     "reopen",
     closures.ReopenAsk,
     Closure,
-    "open a place, or end the maintenance of a robot",
+    "open a place, end the maintenance of a robot, or remove a standing rule",
     asks=STEERING,
     signed=True,
 )
@@ -1051,7 +1051,7 @@ CLOSURES = Verb(
     "closures",
     closures.ClosuresAsk,
     closures.ClosureList,
-    "places and robots out of use; `local`: those whose records are the asked gateway's",
+    "places and robots out of use, and standing rules; `local`: those whose records are the asked gateway's",
     asks=WATCHERS,
 )
 
@@ -1395,9 +1395,9 @@ ALERT_RECORD = RecordKind(
 )
 CLOSURE_RECORD = RecordKind(
     "closure/{closure}",
-    "Closure: a place that is closed, or a robot in maintenance; who, why, until when",
+    "Closure: a place that is closed, a robot in maintenance, or a standing rule; who, why, until when",
     writer="the gateway that an operator asks",
-    removed="when it is opened, or its time is over",
+    removed="when it is opened or removed, or its time is over",
 )
 SCHEDULE_RECORD = RecordKind(
     "schedule/{schedule}",

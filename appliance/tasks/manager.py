@@ -492,6 +492,7 @@ class TaskManager:
             image_of=image_of,
             hindrance=commands.hindrance,
             closed=self._closed,
+            kept_from=self._kept_from,
             shuns=decomposer.memory.experience.shuns,
             site=site,
             expected=decomposer.memory.experience.expected_s,
@@ -748,6 +749,9 @@ class TaskManager:
 
     def _closed(self, subtask: Subtask) -> str:
         return self.context.plans.closed(subtask)
+
+    def _kept_from(self, subtask: Subtask, robot: str) -> str:
+        return self.context.plans.kept_from(subtask, robot)
 
     async def _hurry(self, task: str) -> None:
         await self._takeover.hurry(task)

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from appliance.errors import PlanError
 from appliance.llm.cascade import Decomposer
-from appliance.llm.checks.safety import out_of_use
+from appliance.llm.checks.safety import involved, kept_from, out_of_use
 from appliance.llm.checks.schema import validate
 from appliance.llm.settings import OutOfUse, PlanContext
 from appliance.model import (
@@ -69,7 +69,7 @@ class Plans:
         site: the map plans are checked against.
         task: finds a task's record.
         busy: robots with a run in progress.
-        out_of_use: places that are closed and robots in maintenance.
+        out_of_use: places that are closed, robots in maintenance, standing rules.
     """
 
     def __init__(
@@ -97,6 +97,14 @@ class Plans:
         """Why a subtask may not begin just now: where it goes is closed; empty when it may."""
         context = PlanContext(instruction="", site=self._site, out_of_use=OutOfUse(places=self._out_of_use().places))
         return "; ".join(out_of_use(subtask, context, self._catalogue))
+
+    def kept_from(self, subtask: Subtask, robot: str) -> str:
+        """Which standing rule keeps a robot, or one that works beside it, from a subtask now; "" when none does."""
+        context = self._context("")
+        for each in dict.fromkeys((robot, *involved(subtask, context))) if context.out_of_use.rules else ():
+            if why := kept_from(subtask, each, context, self._catalogue):
+                return why if each == robot else f"held up: {each} is {why}"
+        return ""
 
     def robots(self) -> Robots:
         """The roster as it is known now."""

@@ -80,6 +80,7 @@ class Scheduler:
         image_of: full reference of an image of the catalogue.
         hindrance: why tasks may not command a robot just now; "" when they may.
         closed: why a subtask may not begin just now: the place that it goes to is closed; "" when it may.
+        kept_from: subtask, robot -> the standing rule that keeps the robot from it just now; "" when none does.
         shuns: skill, robot -> why the robot is chosen last for it, by experience; "" if nothing is against it.
         site: the map that ways are reckoned by; None: robots are chosen without their cost.
         expected: skill, robot -> seconds that a run takes, by experience; None when nothing is known.
@@ -96,6 +97,7 @@ class Scheduler:
         image_of: Callable[[str], str],
         hindrance: Callable[[str], str] = lambda _: "",
         closed: Callable[[Subtask], str] = lambda _: "",
+        kept_from: Callable[[Subtask, str], str] = lambda _subtask, _robot: "",
         shuns: Callable[[str, str], str] = lambda _skill, _robot: "",
         site: Site | None = None,
         expected: Expected = lambda _skill, _robot: None,
@@ -107,6 +109,7 @@ class Scheduler:
         self._image_of = image_of
         self._hindrance = hindrance
         self._closed = closed
+        self._kept_from = kept_from
         self._shuns = shuns
         self._site = site
         self._expected = expected
@@ -183,12 +186,29 @@ class Scheduler:
             uses={key: manifest.uses for key, manifest in manifests.items()},
             verbs={key: manifest.verbs for key, manifest in manifests.items()},
             busy=self.busy_robots(),
-            hindrance=self._hindrance,
             shuns=lambda each, robot: self._shuns(each.subtask.skill, robot),
             lost_ns=self._plane.registry.lost_ns,
             choose=by_cost,
         )
-        return bind(target.subtask.robots, choose)
+        return bind(
+            target.subtask.robots, lambda label: choose(label, hindrance=self._hindrance_for(record, target, label))
+        )
+
+    def _hindrance_for(self, record: TaskRecord, target: SubtaskRecord, label: str) -> Callable[[str], str]:
+        """Return what tells why a robot cannot be the one of a label just now, standing rules included.
+
+        One that is chosen for a label does all that is left under it; of one that is known, what begins now counts.
+        """
+        mine = [each for each in record.subtasks if label in each.subtask.robots]
+        known = not is_unnamed(label) or any(label in each.bound for each in mine)
+        begins = [target] if known else [each for each in mine if not each.state.final]
+
+        def hindrance(robot: str) -> str:
+            return self._hindrance(robot) or next(
+                filter(None, (self._kept_from(each.subtask, robot) for each in begins)), ""
+            )
+
+        return hindrance
 
     def _choose_for(self, record: TaskRecord, site: Site) -> Choose:
         """Return what chooses robots for a task by their cost, which is reckoned at most once in `COSTS_S`."""

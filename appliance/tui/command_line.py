@@ -209,6 +209,7 @@ def candidates(kind: str, store: Store, names: Mapping[str, Iterable[str]]) -> l
         "container": lambda: sorted(each.id for each in store.containers.values()),
         "schedule": lambda: [each.schedule.id for each in asked_schedules(store).schedules],
         "place": lambda: [f'"{name}"' if " " in name else name for name in asked_places(store)],
+        "rule": lambda: [each.name for each in store.closures.values() if each.kind == "rule"],
         "run": lambda: sorted(store.runs, key=lambda name: -store.runs[name].started_ns),
         "recipe": recipes.built_in,
         "robots": lambda: ("all", *sorted(store.robots)),

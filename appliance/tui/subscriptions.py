@@ -428,7 +428,8 @@ class FleetView:
 
     async def _ask_closures(self) -> None:
         known = tuple(self.store.closures)
-        self.store.take_closures((await self.orders.closures()).closures, known=known)
+        found = await self.orders.closures()
+        self.store.take_closures((*found.closures, *found.rules), known=known)
 
     async def _ask_runs(self) -> None:
         """Ask for the runs of federated learning, and for what the clients of those that go on are at."""

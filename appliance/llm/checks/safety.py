@@ -17,13 +17,14 @@ from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
-from appliance.llm.checks.consistency import NUMBERS, precedes
+from appliance.llm.checks.consistency import NUMBERS, precedes, stem
 from appliance.llm.checks.facts import Facts
 from appliance.llm.checks.places import known_as, parts_of, shown, spot_of
 from appliance.llm.checks.schema import MAX_PROBLEMS, able, is_unnamed
 from appliance.llm.settings import PlanContext, RobotLimits, SafetyConfig
 from appliance.llm.values import figures
 from appliance.model import Finding, Plan, RobotInfo, Severity, Site, Subtask
+from appliance.model.closures import ANYTHING
 from appliance.skills.catalogue import Catalogue
 
 PLACES = ("place", "area", "station", "path", "at", "to", "into", "asset", "target", "object")
@@ -61,6 +62,7 @@ def _subtask(subtask: Subtask, context: PlanContext, catalogue: Catalogue, confi
     if pattern := matched(subtask.skill, config.skills_never):
         yield f"the policy forbids the skill (safety.skills_never: {pattern}): leave it out"
     yield from (f"{text}: choose another, or wait" for text in out_of_use(subtask, context, catalogue))
+    yield from (f"{text}: choose another robot or place, or wait" for text in _ruled_out(subtask, context, catalogue))
     goals = _goals(subtask, catalogue)
     homes = _homes(subtask, context, catalogue)
     for goal in (*goals, *homes.values()):
@@ -134,9 +136,14 @@ def _candidates(subtask: Subtask, robots: Sequence[RobotInfo] | None, catalogue:
     unnamed = any(is_unnamed(each) or each == "all" for each in names)
     found = [each for each in names if not is_unnamed(each) and each != "all"]
     if unnamed:
-        manifest = catalogue.skills.get(subtask.skill)
-        found += [each.id for each in robots or () if manifest is None or not able(each, manifest)]
+        found += _able(subtask, robots, catalogue)
     return sorted(set(found))
+
+
+def _able(subtask: Subtask, robots: Sequence[RobotInfo] | None, catalogue: Catalogue) -> list[str]:
+    """The robots of the roster that have what a subtask's skill needs."""
+    manifest = catalogue.skills.get(subtask.skill)
+    return [each.id for each in robots or () if manifest is None or not able(each, manifest)]
 
 
 def out_of_use(subtask: Subtask, context: PlanContext, catalogue: Catalogue) -> Iterable[str]:
@@ -149,6 +156,72 @@ def out_of_use(subtask: Subtask, context: PlanContext, catalogue: Catalogue) -> 
     for goal in dict.fromkeys((*_goals(subtask, catalogue), *_homes(subtask, context, catalogue).values())):
         if (place := next((each for each in known_as(goal.name, context.site) if each in closed.places), "")) != "":
             yield f"{goal.said} is {closed.places[place]}"
+
+
+def _ruled_out(subtask: Subtask, context: PlanContext, catalogue: Catalogue) -> Iterable[str]:
+    """Yield each robot of a subtask that a standing rule keeps from it; of one that is still to be chosen, all."""
+    if subtask.robot is None or not context.out_of_use.rules:
+        return
+    named = robots_of(subtask)
+    for robot in involved(subtask, context):
+        if why := kept_from(subtask, robot, context, catalogue):
+            yield f"{robot} is {why}"
+    found = [(each, kept_from(subtask, each, context, catalogue)) for each in _able(subtask, context.robots, catalogue)]
+    kept = [f"{robot} is {why}" for robot, why in found if why]
+    if kept and ("all" in named or (any(is_unnamed(each) for each in named) and len(kept) == len(found))):
+        yield "; ".join(kept[:MAX_PROBLEMS])
+
+
+def involved(subtask: Subtask, context: PlanContext) -> list[str]:
+    """Return the robots that a subtask names: those that do it, and the one of the roster that is given something."""
+    found = {each for each in robots_of(subtask) if not is_unnamed(each) and each != "all"}
+    return sorted(found | {each.id for each in context.robots or () if each.id == subtask.params.get("to")})
+
+
+def kept_from(subtask: Subtask, robot: str, context: PlanContext, catalogue: Catalogue) -> str:
+    """Return the standing rule that keeps a robot from a subtask, in words; empty when none does.
+
+    Args:
+        subtask: any.
+        robot: of the roster; what group one of another name belongs to is not known, so that rules of both count.
+        context: roster, site, and the rules that hold now.
+        catalogue: the skills there are.
+    """
+    info = next((each for each in context.robots or () if each.id == robot), None)
+    for closure in context.out_of_use.rules:
+        rule = closure.rule
+        if rule is None or (rule.robots and robot not in rule.robots):
+            continue
+        if info is not None and rule.group != "all" and info.flies != (rule.group == "flying"):
+            continue
+        if rule.places:
+            homes = _homes(subtask, context, catalogue)
+            goals = [*_goals(subtask, catalogue), *([homes[robot]] if robot in homes else [])]
+            hit = any(set(known_as(goal.name, context.site)) & set(rule.places) for goal in goals)
+        elif rule.things:
+            taken = _taken(subtask, robot, catalogue)
+            hit = taken != "" and any(each == ANYTHING or _is(taken, each) for each in rule.things)
+        else:
+            hit = True
+        if hit:
+            return f"kept from it by standing rule {closure.name} ({closure.text})"
+    return ""
+
+
+def _taken(subtask: Subtask, robot: str, catalogue: Catalogue) -> str:
+    """What a robot takes up in a subtask, alone, with others or from another; empty when it takes up nothing."""
+    manifest = catalogue.skills.get(subtask.skill)
+    if manifest is None:
+        return ""
+    given = "load" in manifest.frees and subtask.params.get("to") == robot
+    takes = given or "load" in manifest.ties or {"robots", "object"} <= set(manifest.params)
+    return (str(subtask.params.get("object", "")) or ANYTHING) if takes else ""
+
+
+def _is(thing: str, said: str) -> bool:
+    """Whether a thing's name has all words of another, in singular or plural; a thing of no name may be any."""
+    words = {stem(each) for each in re.findall(r"\w+", thing.casefold())}
+    return thing == ANYTHING or all(stem(each) in words for each in re.findall(r"\w+", said.casefold()))
 
 
 def _exclusive(plan: Plan, context: PlanContext, catalogue: Catalogue, config: SafetyConfig) -> Iterable[str]:

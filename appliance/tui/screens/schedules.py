@@ -1,4 +1,4 @@
-"""The screen of schedules, closed places and robots in maintenance. `S` opens it over any other; it has no number."""
+"""The screen of schedules, places and robots out of use, and standing rules. `S` opens it over any other."""
 
 import time
 
@@ -68,10 +68,11 @@ def moment(at_ns: int) -> str:
 
 def closure_cells(closure: Closure) -> tuple[Cell, ...]:
     """Return the cells of a row of what is out of use."""
-    word = "◌ closed" if closure.kind == "place" else "◌ maint."
+    word = {"place": "◌ closed", "robot": "◌ maint."}.get(closure.kind, "◌ rule")
+    name = closure.name if closure.rule is None else closure.rule.text
     return (
         (word, "yellow"),
-        (safe(closure.name, 100), "bold"),
+        (safe(name, 200), "bold"),
         moment(closure.until_ns),
         safe(closure.by.by, 60),
         safe(closure.by.why, 200),
@@ -79,7 +80,7 @@ def closure_cells(closure: Closure) -> tuple[Cell, ...]:
 
 
 class SchedulesScreen(FleetScreen):
-    """Schedules above, what is out of use below."""
+    """Schedules above, what is out of use and standing rules below."""
 
     scope = "schedules"
     shows = ("asked", "closures")
@@ -93,7 +94,9 @@ class SchedulesScreen(FleetScreen):
         """Make the parts."""
         yield Grid(COLUMNS, schedule_cells, id="schedules", empty="no schedules: n adds one")
         yield Static(id="about")
-        yield Grid(CLOSURES, closure_cells, id="closures", empty="no place is closed, no robot is in maintenance")
+        yield Grid(
+            CLOSURES, closure_cells, id="closures", empty="nothing is out of use, and there are no standing rules"
+        )
 
     def on_mount(self) -> None:
         """Ask for the schedules while the screen is seen: they are put nowhere."""
@@ -133,7 +136,7 @@ class SchedulesScreen(FleetScreen):
         self.say("#about", Text() if shown is None else about(shown))
 
     def chosen(self) -> dict[str, str]:
-        """Return the selected schedule with its last task, or the selected place or robot, by which has the focus."""
+        """Return the selected schedule with its last task, or place, robot or rule, by which table has the focus."""
         grid = self.focused
         if not isinstance(grid, Grid) or grid.thing is None:
             return {}

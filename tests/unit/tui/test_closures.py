@@ -9,7 +9,8 @@ import pytest
 from msgspec.structs import replace
 
 from appliance.model import Word
-from appliance.model.closures import Closure, ClosureList
+from appliance.model.closures import Closure, ClosureList, Rule
+from appliance.model.schedules import ScheduleList
 from appliance.operations import until_and_why
 from appliance.plane.settings import PlaneConfig
 from appliance.tui.app import SwiftbotApp
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.anyio
 ROBOT = Closure(kind="robot", name="drone-1", by=Word(by="ann", why="tyres", at_ns=5))
 PLACE = Closure(kind="place", name="gate", by=Word(by="ann", at_ns=5))
+RULE = Closure(kind="rule", name="r-1", rule=Rule(places=("gate",)), by=Word(by="ann", why="wet", at_ns=5))
 
 
 @pytest.mark.parametrize("size", [(80, 24), (160, 48)])
@@ -45,6 +47,20 @@ async def test_the_screen_of_robots_shows_what_is_out_of_use(view: "FakeView", s
         assert "maint" not in await settle(app, pilot)
 
 
+async def test_a_rule_is_listed_and_removed_where_closed_places_are(view: "FakeView") -> None:
+    """What it says, by whom and why; `R` on its row asks, and then removes it."""
+    view.orders.answers |= {"schedules": ScheduleList(), "site": SITE}
+    app = SwiftbotApp(view)
+    async with app.run_test(size=(120, 30)) as pilot:
+        await pilot.press("W", "S")
+        view.store.take_closure(RULE)
+        shown = await settle(app, pilot)
+        assert "◌ rule" in shown
+        assert "all robots: never go to gate" in shown
+        await pilot.press("tab", "R")
+        assert "Remove standing rule r-1?" in " ".join((await settle(app, pilot)).split())
+
+
 def test_an_older_word_changes_nothing(view: "FakeView") -> None:
     """Puts may come in either order, and an answer may be older than a put."""
     view.store.take_closure(ROBOT)
@@ -59,12 +75,12 @@ async def test_what_is_out_of_use_is_asked_for(monkeypatch: pytest.MonkeyPatch) 
 
     class Orders:
         async def closures(self) -> ClosureList:
-            return ClosureList(closures=(ROBOT,))
+            return ClosureList(closures=(ROBOT,), rules=(RULE,))
 
     made = FleetView(PlaneConfig(), "test")
     monkeypatch.setattr(FleetView, "orders", Orders())
     await made._ask_closures()
-    assert set(made.store.closures) == {ROBOT.id}
+    assert set(made.store.closures) == {ROBOT.id, RULE.id}
 
 
 def test_a_map_calls_a_closed_place_closed() -> None:
