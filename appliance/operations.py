@@ -29,8 +29,10 @@ from appliance.errors import ConfigError, NotFoundError, PayloadError, RefusedEr
 from appliance.estimate import Estimate
 from appliance.estimate import estimate as estimate_plan
 from appliance.learn import tables
+from appliance.llm.rule_words import rule_words
 from appliance.model import Plan, RobotInfo, Site, TaskRecord, TaskRequest
 from appliance.model.alerts import AlertsAcked
+from appliance.model.closures import Rule
 from appliance.model.learning import MOST_ROUNDS, RunRecord
 from appliance.model.pool_api import Evicted, WarmAsk
 from appliance.model.robot_api import LEASE_S
@@ -1013,7 +1015,38 @@ async def end_maintenance(client: FleetClient, robot: RobotId, *, why: Why = "")
     return Outcome(value=found, text=f"{found.name} is in use again; it was {found.text}")
 
 
+RuleText = Annotated[str, Kind("text", "Rule in words: who never does what, and when.", rest=True)]
 RuleId = Annotated[str, Kind("rule", "Rule ID, as `swiftbot rules list` shows it.")]
+
+
+@operation(
+    "rules add", name="add-rule", title="Add rule", role=Role.OPERATOR, audit="rule_add", footer=False, call="rule",
+    danger="Add a standing rule? {text}. Plans against it are refused, and subtasks that have not begun wait.",
+)  # fmt: skip
+async def add_rule(client: FleetClient, text: RuleText) -> Outcome:
+    """Add a standing rule in words, such as "all robots: never go to dock 2 from 18:00 to 06:00"."""
+    added = await client.add_rule(await read_rule(client, text, due.local_zone()), why=text[:MAX_WHY])
+    return Outcome(value=added, text=f"added {added.name}: {added.text}")
+
+
+async def read_rule(client: FleetClient, text: str, zone: str) -> Rule:
+    """Return the rule that a text says.
+
+    Args:
+        client: whose robots and places may be named.
+        text: as typed.
+        zone: IANA name of the zone of its hours, where it names none.
+
+    Raises:
+        PayloadError: no rule says it whole; the message says why.
+    """
+    site, robots = await client.site(), tuple(client.plane.registry.robots.values())
+    found = rule_words(text, robots, site, zone=zone)
+    if found is None or found.rule is None:
+        why = found.problem if found is not None else "it says of no robots what they never do"
+        remedy = 'say it like "no drone enters the aisle from 18:00 to 06:00", or by options: swiftbot rules add --help'
+        raise PayloadError(f"no standing rule: {why}", remedy=remedy)
+    return found.rule
 
 
 @operation(

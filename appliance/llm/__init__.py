@@ -1,9 +1,9 @@
 """Instruction to validated plan: the cascade of tiers and what belongs to each.
 
 Doors: `cascade.Decomposer` with `peers.PeerTier`; `settings`; `stop_words` with `preprocessing.stop_refused`;
-`training_words` with `preprocessing.training_refused`; `checks.schema` (whether a plan can be run at all),
-`checks.safety.strictest`, `checks.safety.out_of_use`, `checks.safety.kept_from` and `checks.safety.involved`; `batch`
-(many instructions of a file).
+`training_words` with `preprocessing.training_refused`; `rule_words`; `checks.schema` (whether a plan can be run at
+all), `checks.safety.strictest`, `checks.safety.out_of_use`, `checks.safety.kept_from` and `checks.safety.involved`;
+`batch` (many instructions of a file).
 
 Way of an instruction: `preprocessing` -> `plan_cache` -> `tiers` in order, as `routing` allows ->
 `completion` -> `review` by `checks`; `feedback` keeps what became of the plans. Tiers keep the contract in `tier`:

@@ -27,9 +27,10 @@ from appliance.llm.checks.schema import MAX_PROBLEMS, validate
 from appliance.llm.completion import completed
 from appliance.llm.feedback import Memory
 from appliance.llm.plan_cache import catalogue_digest, digest, plan_key
-from appliance.llm.preprocessing import explained, no_plan, refused, stop_refused, told, training_refused
+from appliance.llm.preprocessing import explained, no_plan, refused, rule_refused, stop_refused, told, training_refused
 from appliance.llm.review import Facts, Review, reasons, review
 from appliance.llm.routing import Budget, Gate, Privacy, Thresholds
+from appliance.llm.rule_words import rule_words
 from appliance.llm.settings import LlmConfig, PlanContext, PlanOutcome, SafetyConfig, so_far
 from appliance.llm.stop_words import stop_request
 from appliance.llm.tier import Planner, Proposal
@@ -295,6 +296,8 @@ class Decomposer:
             raise stop_refused(stop)
         if (training := training_request(context.instruction, [each.id for each in context.robots or ()])) is not None:
             raise training_refused(training)
+        if (said := rule_words(context.instruction, context.robots or (), context.site)) is not None and said.rule:
+            raise rule_refused(context.instruction)
 
         words = told(context)
 

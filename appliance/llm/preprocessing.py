@@ -11,6 +11,7 @@ they were typed and by the whole roster, so that nothing is lost by it.
 
 import json
 import re
+import shlex
 import unicodedata
 from collections.abc import Sequence, Set
 from typing import Any
@@ -117,6 +118,11 @@ def training_refused(training: TrainingRequest) -> RefusedError:
             remedy=f"{training.command}; swiftbot robots lists their names",
         )
     return RefusedError("this is a run of federated learning, not a task", remedy=training.command)
+
+
+def rule_refused(text: str) -> RefusedError:
+    """Return the error for a text that is a mere prohibition: never planned, but offered as a standing rule."""
+    return RefusedError("this is a standing rule, not a task", remedy=f"swiftbot rules add {shlex.quote(text.strip())}")
 
 
 def no_plan(attempts: Sequence[TierAttempt], why: str, refusals: Sequence[Finding] = ()) -> PlanError:

@@ -18,6 +18,7 @@ from typing import ClassVar, cast
 import structlog
 from rich.console import Group, RenderableType
 from rich.text import Text
+from textual import work
 from textual.app import App
 from textual.command import DiscoveryHit, Hit, Hits, Provider
 from textual.css.query import NoMatches
@@ -28,15 +29,17 @@ from textual.widgets import Input
 
 from appliance.alerts.rules import ordered
 from appliance.errors import ConfigError, PayloadError, SwiftbotError, UnreachableError
+from appliance.llm.rule_words import rule_words
 from appliance.llm.stop_words import stop_request
 from appliance.llm.training_words import training_request
-from appliance.model import Approval, TaskRecord
+from appliance.model import Approval, Site, TaskRecord
 from appliance.model.alerts import Alert, Subject
 from appliance.model.messages import enums_open
 from appliance.model.roles import lacks
-from appliance.operations import STOP_IN_WORDS, Operation
+from appliance.operations import STOP_IN_WORDS, Operation, read_rule
 from appliance.plane.settings import PlaneConfig
 from appliance.process import gentle_collector
+from appliance.schedules import due
 from appliance.tui import actions, command_line, task_view, themes
 from appliance.tui.actions import PROMPTS, bindings, key_name, keymap, keys_of, shown
 from appliance.tui.ascii_terminal import driver_for, in_browser
@@ -377,6 +380,18 @@ class SwiftbotApp(App[None], inherit_bindings=False):
         self.call_later(self.begin, command_line.fill(actions.BY_NAME["learn-start"], given, {}))
         return True
 
+    def rules_in_words(self, text: str) -> bool:
+        """Read the standing rule back that a text says, then add it if it is meant; False when it says none.
+
+        While the site's places are not known the planner refuses it, with the command.
+        """
+        site = self.view.store.asked.get(command_line.PLACES)
+        found = rule_words(text, list(self.view.store.robots.values()), site if isinstance(site, Site) else None)
+        if found is None or found.rule is None:
+            return False
+        self.call_later(self.begin, command_line.fill(actions.BY_NAME["add-rule"], {"text": text}, {}))
+        return True
+
     def _allowed(self) -> bool:
         if not self.view.steerable:
             self.notify("a recorded log cannot be steered", severity="warning")
@@ -524,9 +539,25 @@ class SwiftbotApp(App[None], inherit_bindings=False):
             instruction=given.get("instruction", ""),
             own=self.config.keys,
             stops=self.stops_in_words,
-            trains=self.trains_in_words,
+            begins=lambda text: self.trains_in_words(text) or self.rules_in_words(text),
         )
         self.push_screen(dialog, submitted)
+
+    @work(group="orders")
+    async def do_rule(self, given: Mapping[str, str]) -> None:
+        """Read back the rule that a text says; it is added once a person says that it is meant."""
+        try:
+            rule = await read_rule(self.view.orders, given["text"], due.local_zone())
+        except SwiftbotError as error:
+            self.tell(error)
+            return
+        command = Command(action=actions.BY_NAME["add-rule"], given={"text": rule.text})
+
+        def answered(yes: bool | None) -> None:
+            if yes:
+                self.carry_out(command)
+
+        self.push_screen(ConfirmDialog(safe(command.action.sentence(command.given))), answered)
 
     def do_review(self, given: Mapping[str, str]) -> None:
         """Look at the plan of a task that waits for approval: of the selected task, else the one that waits longest."""

@@ -3,12 +3,15 @@
 # pyright: reportUnknownLambdaType=false, reportUnknownArgumentType=false
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
+from appliance import console
+from appliance.cli import rules
 from appliance.cli.common import Where
 from appliance.errors import NotFoundError
-from appliance.model import Word
+from appliance.model import Place, RobotInfo, Site, Word
 from appliance.model.closures import Closure, ClosureList, Rule
 from tests.unit.test_cli_faults_seen import run
 
@@ -18,12 +21,18 @@ class Fleet:
 
     def __init__(self) -> None:
         self.rules: dict[str, Closure] = {}
+        robots = {"rover_1": RobotInfo(id="rover_1", kind="zenoh")}
+        self.plane = SimpleNamespace(registry=SimpleNamespace(robots=robots))
 
     async def __aenter__(self) -> "Fleet":
         return self
 
     async def __aexit__(self, *_: object) -> None:
         return None
+
+    async def site(self) -> Site:
+        """Return the map."""
+        return Site(places={"dock 2": Place(x=1.0, y=2.0)})
 
     async def closures(self) -> ClosureList:
         """Return them."""
@@ -104,5 +113,45 @@ def test_what_is_no_rule_is_refused(
 ) -> None:
     """Nothing is asked of the fleet."""
     assert run("rules", "add", *words) == 2
+    assert says in " ".join(capsys.readouterr().err.split())
+    assert fleet.rules == {}
+
+
+def test_words_are_read_back_and_confirmed(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a terminal a person is asked; a script says --yes, and without it nothing is added but told how it is read."""
+    text = "Rover_1 never goes to dock 2 between 22:00 and 06:00"
+    read = "rover_1: never go to dock 2 from 22:00 to 06:00 UTC"
+    assert run("rules", "add", text, "--zone", "UTC") == 2
+    assert f"read as: {read}" in " ".join(capsys.readouterr().err.split())
+    asked: list[str] = []
+    monkeypatch.setattr(rules, "on_terminal", lambda: True)
+    answers = iter(("n", "y"))
+    monkeypatch.setattr(console.out, "input", lambda question, **_: asked.append(question) or next(answers))
+    assert run("rules", "add", text, "--zone", "UTC") == 7
+    assert fleet.rules == {}
+    assert run("rules", "add", text, "--zone", "UTC") == 0
+    assert [each.splitlines()[0] for each in asked] == [read, read]
+    (added,) = fleet.rules.values()
+    assert (added.rule is not None and added.rule.text, added.by.why) == (read, text)
+    assert run("rules", "add", "never go to dock 2", "--yes", "--why", "wet") == 0
+    assert len(fleet.rules) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("no robot flies over dock 2", "--yes"), '"over"'),
+        (("go to dock 2", "--yes"), "what they never do"),
+        (("never go to dock 9", "--yes"), "dock 9"),
+        (("never go to dock 2", "--yes", "--robot", "rover_1"), "in words or by options"),
+    ],
+)
+def test_words_that_no_rule_says_are_refused(
+    words: tuple[str, ...], says: str, fleet: Fleet, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the reason, and how a rule is said."""
+    assert run("rules", "add", *words) != 0
     assert says in " ".join(capsys.readouterr().err.split())
     assert fleet.rules == {}

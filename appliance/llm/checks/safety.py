@@ -219,9 +219,9 @@ def _taken(subtask: Subtask, robot: str, catalogue: Catalogue) -> str:
 
 
 def _is(thing: str, said: str) -> bool:
-    """Whether a thing's name has all words of another, in singular or plural; a thing of no name may be any."""
-    words = {stem(each) for each in re.findall(r"\w+", thing.casefold())}
-    return thing == ANYTHING or all(stem(each) in words for each in re.findall(r"\w+", said.casefold()))
+    """Whether a thing may be what is said: one name has all words of the other, in singular or plural."""
+    one, other = ({stem(word) for word in re.findall(r"\w+", each.casefold())} for each in (thing, said))
+    return thing == ANYTHING or one <= other or other <= one
 
 
 def _exclusive(plan: Plan, context: PlanContext, catalogue: Catalogue, config: SafetyConfig) -> Iterable[str]:

@@ -270,7 +270,8 @@ def negation(facts: Facts) -> Iterable[Finding]:
         elif scope.kept:
             inside = set(scope.at)
             if not any(each - inside for each in facts.account.evidence.values()):
-                yield _hold("negation", f'"{scope.words[0]}" forbids something and asks for nothing', scope.words)
+                said = f'"{scope.words[0]}" forbids something and asks for nothing'
+                yield _hold("negation", said, scope.words, hint="swiftbot rules add makes a standing rule of it")
             else:
                 yield Finding(
                     check="negation", severity=Severity.NOTE, words=scope.words,

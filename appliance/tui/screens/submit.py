@@ -26,6 +26,7 @@ from appliance.model import Approval, RobotInfo, Site, TaskRecord, TaskRequest
 from appliance.model.task_api import PlanAnswer
 from appliance.tui import plan_editor
 from appliance.tui.actions import DIALOG_KEYS, key_name
+from appliance.tui.command_line import PLACES
 from appliance.tui.safe import safe
 from appliance.tui.subscriptions import View
 from appliance.tui.task_view import plan_lines
@@ -276,7 +277,7 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
         instruction: str = "",
         own: Mapping[str, str] | None = None,
         stops: Callable[[str], bool] = lambda _: False,
-        trains: Callable[[str], bool] = lambda _: False,
+        begins: Callable[[str], bool] = lambda _: False,
     ) -> None:
         """Make the dialog.
 
@@ -286,10 +287,11 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
             instruction: its first content.
             own: the operator's own keys.
             stops: carries a text out that is a soft stop; False when it is none.
-            trains: begins the run of federated learning that a text asks for; False when it asks for none.
+            begins: begins what a text asks for that is no plan, such as a run of federated learning or a standing rule;
+                False when it asks for none.
         """
         super().__init__()
-        self._stops, self._trains = stops, trains
+        self._stops, self._begins = stops, begins
         key = (own or {}).get("edit-first", DIALOG_KEYS["edit-first"]).split(",")[0].strip()
         self._may = _REVIEW.format(key=key_name(key))
         self._view = view
@@ -328,6 +330,7 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
             site = await self._view.orders.site()
         except SwiftbotError:
             return
+        self._view.store.asked.put(PLACES, site)
         if self.is_mounted:
             field = self.query_one(InstructionInput)
             field.names = names_of(sorted(self._view.store.robots), site)
@@ -344,7 +347,7 @@ class SubmitDialog(ModalScreen[TaskRecord | None]):
     def entered(self, event: Input.Submitted) -> None:
         """Plan the instruction, or run the plan that is shown for it; a stop is carried out at once."""
         instruction = event.value.strip()
-        if self._stops(instruction) or (not self._busy and self._trains(instruction)):
+        if self._stops(instruction) or (not self._busy and self._begins(instruction)):
             self.action_leave()
         elif self._busy:
             pass

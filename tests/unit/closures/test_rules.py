@@ -148,6 +148,8 @@ GLASS = Rule(robots=("rover_1",), things=("glass",))
         (GLASS, step("pick", "rover_1", object="glass bottle"), True),
         (GLASS, step("pick", "rover_1", object="the Glasses"), True),
         (GLASS, step("pick", "rover_1", object="red box"), False),
+        (Rule(things=("red box",)), step("pick", "rover_1", object="box"), True),
+        (Rule(things=("red box",)), step("pick", "rover_1", object="blue box"), False),
         (GLASS, step("pick", "rover_2", object="glass"), False),
         (GLASS, step("place", "rover_1", object="glass", at="dock 2"), False),
         (GLASS, step("photograph", "rover_1", target="glass"), False),

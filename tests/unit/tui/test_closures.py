@@ -3,10 +3,12 @@
 # pyright: reportPrivateUsage=false, reportArgumentType=false
 
 import time
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from msgspec.structs import replace
+from textual.widgets import Input
 
 from appliance.model import Word
 from appliance.model.closures import Closure, ClosureList, Rule
@@ -59,6 +61,27 @@ async def test_a_rule_is_listed_and_removed_where_closed_places_are(view: "FakeV
         assert "all robots: never go to gate" in shown
         await pilot.press("tab", "R")
         assert "Remove standing rule r-1?" in " ".join((await settle(app, pilot)).split())
+
+
+async def test_a_prohibition_that_is_typed_is_read_back(view: "FakeView") -> None:
+    """As the rule that it is; it is added once a person says yes, and kept in the words that were read."""
+    added = replace(RULE, rule=Rule(places=("gate",), begin_min=18 * 60, zone="UTC"))
+    orders: Any = view.orders
+    orders.answers |= {"site": SITE, "add_rule": added}
+    orders.plane = SimpleNamespace(registry=SimpleNamespace(robots=dict(view.store.robots.items())))
+    app = SwiftbotApp(view)
+    async with app.run_test(size=(120, 30)) as pilot:
+        await pilot.press("W", "s")
+        await settle(app, pilot)
+        app.screen.query_one(Input).value = "nobody goes to the gate after 18:00"
+        await pilot.press("enter")
+        shown = " ".join((await settle(app, pilot)).split())
+        assert "all robots: never go to gate from 18:00 to 24:00" in shown
+        assert not [each for each in orders.asked if each[0] == "add_rule"]
+        await pilot.press("y")
+        await settle(app, pilot)
+        ((_, rule),) = (each for each in orders.asked if each[0] == "add_rule")
+        assert (rule.places, rule.begin_min) == (("gate",), 18 * 60)
 
 
 def test_an_older_word_changes_nothing(view: "FakeView") -> None:

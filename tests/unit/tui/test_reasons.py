@@ -105,6 +105,7 @@ def test_audited_operations_are_verbs_of_gateways() -> None:
         "place_open",
         "robot_maintain",
         "robot_maintain_end",
+        "rule_add",
         "rule_remove",
     }
     apart |= {"schedule_pause", "schedule_resume", "schedule_remove"}
