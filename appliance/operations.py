@@ -1021,7 +1021,7 @@ RuleId = Annotated[str, Kind("rule", "Rule ID, as `swiftbot rules list` shows it
 
 @operation(
     "rules add", name="add-rule", title="Add rule", role=Role.OPERATOR, audit="rule_add", footer=False, call="rule",
-    danger="Add a standing rule? {text}. Plans against it are refused, and subtasks that have not begun wait.",
+    danger='Add the standing rule "{text}"? Plans against it are refused, and subtasks that have not begun wait.',
 )  # fmt: skip
 async def add_rule(client: FleetClient, text: RuleText) -> Outcome:
     """Add a standing rule in words, such as "all robots: never go to dock 2 from 18:00 to 06:00"."""

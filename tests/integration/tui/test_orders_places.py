@@ -184,8 +184,29 @@ async def test_robots_and_places_out_of_use(ann: Operator, client: FleetClient) 
     await ann.until(lambda: ann.chosen.get("robot") == "rover_1")
     await ann.press("e")
     await confirm(ann, "End the maintenance of rover_1?")
-    await ann.see("no place is closed")
+    await ann.see("nothing is out of use")
     assert not (await client.closures()).closures
+
+
+@does("add-rule", "remove-rule")
+async def test_a_standing_rule_in_words(ann: Operator, client: FleetClient) -> None:
+    """It is read back before it is added, listed, and removed from its row; none is added half read."""
+    await ann.line("add-rule rover_1 never goes to dock 3 between 22:00 and 06:00")
+    await confirm(ann, "rover_1:", "22:00")
+    await ann.hears("rover_1: never go to dock 3")
+    (added,) = (await client.closures()).rules
+    assert (added.rule is not None and added.rule.places, added.by.by) == (("dock 3",), "ann")
+    await ann.line("add-rule no robot flies over dock 3")
+    await ann.see("not what they pass")
+    assert (await client.closures()).rules == (added,)
+    await ann.press("S")
+    await ann.see("◌ rule", "rover_1:")
+    await ann.press("tab")
+    await ann.until(lambda: ann.chosen.get("rule") == added.name)
+    await ann.press("R")
+    await confirm(ann, f"Remove standing rule {added.name}?")
+    await ann.see("nothing is out of use")
+    assert not (await client.closures()).rules
 
 
 @does("schedule-add", "schedule-pause", "schedule-resume", "schedule-remove")

@@ -66,7 +66,16 @@ async def test_why_goes_along_with_an_order(view: "FakeView", line: str, verb: s
 def test_orders_that_change_something_take_why() -> None:
     """Every order of the registry that a gateway audits can be given a reason; an answer is its own."""
     without = {action.name for action in ACTIONS if action.writes and "why" not in {each.name for each in action.takes}}
-    assert without == {"submit", "duplicate", "answer", "release-robot", "put-down", "bring-back", "schedule-add"}
+    assert without == {
+        "submit",
+        "duplicate",
+        "answer",
+        "release-robot",
+        "put-down",
+        "bring-back",
+        "schedule-add",
+        "add-rule",
+    }
 
 
 async def test_a_name_written_wrongly_does_not_stop_nobody(view: "FakeView") -> None:
