@@ -292,9 +292,9 @@ class Floor:
         for end, _ in go.sweep:
             if not SHORTEST_M <= end <= last:
                 continue
-            spot = geometry.ahead(go.way, end)[-1][:2]
-            # A drone does not stop above where it takes off.
-            if math.dist(spot, me.at[:2]) >= SHORTEST_M and self._clear_of_others(spot, me, others):
+            x, y, z = geometry.ahead(go.way, end)[-1]
+            takes_off = z > me.at[2] and math.dist((x, y), me.at[:2]) < SHORTEST_M
+            if not takes_off and self._clear_of_others((x, y), me, others):
                 found.append(end)
         return found
 
@@ -372,13 +372,13 @@ class Floor:
                 why = f"waits for {place}, after {first_in_line.robot}"
                 return Wait(robot=there[0].robot if there else "", why=why, place=place, way=way, in_line=True)
         taken = [(each.bound[-1] if each.bound else each.at, each.size.kept_m) for each in others]
+        lost = _walls_of_lost(others, me)
         spots = [
             (*spot, goal[2])
-            for spot in self._spots(place, me.size, max(capacity, 1 + len(there)))
+            for spot in self._spots(place, me.size, max(capacity, 1 + len(there)), off_cells=bool(lost))
             if all(math.dist(spot, end[:2]) >= me.size.kept_m + kept for end, kept in taken)
         ]
         if spots:
-            lost = _walls_of_lost(others, me)
             off = (spot for spot in spots if all(wall.gap(spot[:2]) >= me.size.kept_m for wall in lost))
             return next(off, spots[0])
         near = min(others, key=lambda each: math.dist(each.at[:2], self._centre(place)))
@@ -399,13 +399,15 @@ class Floor:
             return False
         return math.dist(end[:2], self._centre(place)) <= (PLACE_M if self.capacity[place] == 1 else SIDE_M)
 
-    def _spots(self, place: str, size: Size, count: int) -> Iterable[Flat]:
-        """Yield spots to stand at a place: its centre, round it, and off the cells of a lost robot there."""
+    def _spots(self, place: str, size: Size, count: int, *, off_cells: bool) -> Iterable[Flat]:
+        """Yield spots to stand at a place: its centre, round it, and `off_cells` of one that stands in the centre."""
         x, y = self._centre(place)
         yield x, y
         angles = [math.tau * turn / 6 for turn in range(6)]
-        near = 2 * size.kept_m + 3 * APART_M  # a robot arrives within some centimetres
-        for ring, most in ((near, count - 1), (2 * size.kept_m + 1.5 * geometry.CELL_M, 6 * (count > 1))):
+        rings = [(2 * size.kept_m + 3 * APART_M, count - 1)]  # a robot arrives within some centimetres
+        if off_cells and count > 1:
+            rings.append((2 * size.kept_m + 1.5 * geometry.CELL_M, len(angles)))
+        for ring, most in rings:
             round_it = [(round(x + ring * math.sin(each), 3), round(y + ring * math.cos(each), 3)) for each in angles]
             yield from [spot for spot in round_it if self._open(spot, size)][:most]
 
