@@ -81,7 +81,7 @@ from appliance.robots.limits import Bounds, Orders, Usual
 from appliance.schedules import records as schedule_records
 from appliance.schedules.manager import ScheduleManager
 from appliance.skills.catalogue import Catalogue, load_catalogue
-from appliance.skills.sites import load_site
+from appliance.skills.sites import differs, load_site
 from appliance.tasks.admission import refuse_commands
 from appliance.tasks.artifacts import SPARE_PLACES, ArtifactCopies, Artifacts
 from appliance.tasks.audit import Audit
@@ -247,6 +247,8 @@ def both(first: Callable[[T], None], second: Callable[[T], None] | None) -> Call
 
 
 VERSION = "0.1.0"
+SITE_S = 10.0
+"""How often a gateway looks whether the site's file is still what it uses."""
 SETTLE_S = 3.0
 """How long a draining gateway waits for the ends of its runs to be written: a replicated write takes milliseconds."""
 
@@ -424,6 +426,7 @@ class Gateway:
             "session": self.plane.until_gone(),
             "retention": self._retention.run(),
             "copies of files": copies.run(),
+            "site": self._watch_site(site),
         }
         root_tasks |= {"observer": observer.run()} if observer else {}
         root_tasks |= {"delivery of alerts": self._delivery.run()} if self._delivery else {}
@@ -633,6 +636,17 @@ class Gateway:
             return reference(spec, self.config.pool) if spec is not None else ""
 
         return name
+
+    async def _watch_site(self, site: Site) -> None:
+        """Tell where the site's file is not what is used: a broken one would keep this gateway from starting again."""
+        lacking = self._site_problem
+        while True:
+            await asyncio.sleep(SITE_S)
+            problem = await asyncio.to_thread(differs, self.config.site, site) or lacking
+            if problem != self._site_problem:
+                self._site_problem = problem
+                log.warning("site", problem=problem or "the file is as it was loaded")
+                self._changed.set()
 
     def _load(self) -> tuple[Catalogue, Site]:
         catalogue = load_catalogue(tuple(Path(each).expanduser() for each in self.config.skills))

@@ -122,7 +122,8 @@ def _gateways(facts: Facts) -> Iterator[Finding]:
         if not status.limits_enforced:
             yield of("no-limits", WARNING, "container limits are not enforced (no cgroups)", "`swiftbot doctor` there")
         if status.site_problem:
-            yield of("site", WARNING, status.site_problem, "add [fence] to the site's file")
+            remedy = "`swiftbot site check FILE`, add what is missing ([fence]), then restart the gateway"
+            yield of("site", WARNING, status.site_problem, remedy)
         if not works_beside(status):
             what = f"version {status.version} speaks protocol {status.protocol}, which the others do not"
             yield of("version", CRITICAL, what, "`swiftbot upgrade` brings all gateways to one version")

@@ -264,7 +264,8 @@ class GatewayStatus(Struct, frozen=True, kw_only=True, omit_defaults=True):
     pool_problem: str = ""
     """Why the pool cannot start containers, or holds fewer than it may for want of memory; empty when all is well."""
     site_problem: str = ""
-    """What the site's map lacks to keep robots on it, such as a fence; empty when all is well."""
+    """What the site's map lacks to keep robots on it, such as a fence, or that its file has changed or broken since the
+    start; empty when all is well."""
     keys_problem: str = ""
     """What is to be done about certificates soon, such as one that expires; empty when nothing is."""
     parts: str = ""

@@ -48,6 +48,15 @@ def load_site(where: str | Path) -> Site:
     return site
 
 
+def differs(where: str | Path, site: Site) -> str:
+    """Return how a site's file differs from the site that was loaded of it; empty: it does not."""
+    try:
+        found = load_site(where)
+    except ConfigError as error:
+        return f"the site's file cannot be loaded any more ({error.message}): the site from before is used"
+    return "" if found == site else "the site's file has changed: the site from before is used until a restart"
+
+
 def plain_name(name: str) -> str:
     """Return a name as instructions and sites compare it: lower case, single spaces, no articles."""
     return " ".join(word for word in name.lower().replace("_", " ").split() if word not in ("the", "a", "an"))

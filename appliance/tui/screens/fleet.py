@@ -99,6 +99,8 @@ def notes_of(gateway: Gateway) -> list[Note]:
         )
     if each.site_problem:
         text, remedy = safe(each.site_problem), "add [fence] to the site's file: points outside it are then refused"
+        if "fence" not in each.site_problem:
+            remedy = "`swiftbot site check FILE`, then restart the gateway"
         found.append(Note(kind="site", weight=3, about="gateway", glyph="▲", style="yellow", text=text, remedy=remedy))
     if each.keys_problem:
         text, remedy = safe(each.keys_problem), "`swiftbot keys list`, then `swiftbot keys renew ROLE NAME`"

@@ -5,7 +5,25 @@ from pathlib import Path
 import pytest
 
 from appliance.errors import ConfigError
-from appliance.skills.sites import load_site
+from appliance.skills.sites import SITES, differs, load_site
+
+
+def test_a_file_that_is_not_what_was_loaded_is_told(tmp_path: Path) -> None:
+    """Changed, broken or gone it is told, with the cause; mended it is not told any more."""
+    file = tmp_path / "yard.toml"
+    good = SITES.joinpath("warehouse.toml").read_text(encoding="utf-8")
+    file.write_text(good)
+    site = load_site(file)
+    assert differs(file, site) == ""
+    file.write_text(good + "\n[places.far]\nx = 1.5\ny = 1.5\n")
+    assert differs(file, site) == "the site's file has changed: the site from before is used until a restart"
+    file.write_text(good + "\n[places.far]\nx = \n")
+    assert "cannot be loaded any more" in differs(file, site)
+    assert "yard.toml" in differs(file, site)
+    file.unlink()
+    assert "there is no site" in differs(file, site)
+    file.write_text(good)
+    assert differs(file, site) == ""
 
 
 def test_the_warehouse_has_what_the_demo_names() -> None:
