@@ -65,8 +65,9 @@ _LASTING = ContractError
 class Call(Struct, frozen=True, kw_only=True):
     """What a handler asks of the appliance; `number` counts its calls from 1, the same in every attempt.
 
-    `name` and `args`: `command` {verb, timeout_s, args}; `notify` {to, text}; `put_artifact` {name, data: bytes,
-    media_type}; `get_artifact` {ref}. Answers may hold bytes anywhere.
+    `name` and `args`: `command` {verb, timeout_s, args}; `command_all` {verb, timeout_s, robots: args by robot};
+    `notify` {to, text}; `put_artifact` {name, data: bytes, media_type}; `get_artifact` {ref}. Answers may hold bytes
+    anywhere.
     """
 
     run: RunRequest
@@ -82,6 +83,7 @@ def order(request: RunRequest) -> Frame:
         "run": request.run_id,
         "skill": request.skill,
         "robot": request.robot,
+        "others": request.others,
         "params": request.params,
         "inputs": request.inputs,
         "attempt": request.attempt,

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from appliance.errors import ConflictError, PayloadError, RobotError, SwiftbotError, from_code
 from appliance.floor.keeper import FloorKeeper
-from appliance.model import Notice, RobotCommand, RobotReply, encode, keyspace
+from appliance.model import Failure, Notice, RobotCommand, RobotReply, encode, keyspace
 from appliance.model.keys import check_name
 from appliance.model.task_api import ArtifactAsk, ArtifactPiece
 from appliance.plane.node import Plane
@@ -30,6 +30,7 @@ from appliance.tasks.artifacts import ArtifactCopies, Artifacts
 from appliance.tasks.enquiries import Enquiries, enquiry_of
 from appliance.tasks.placement import waits_for_lost
 from appliance.tasks.records import MAX_RUN_S, clean, task_key
+from appliance.tasks.together import Together
 
 log = structlog.get_logger(__name__)
 
@@ -84,6 +85,7 @@ class Calls:
         self._copies = copies
         self._on_wait = on_wait
         self._offered: dict[str, Offer] = {}
+        self._together = Together(plane, hindrance=hindrance)
 
     def offer(self, name: str, answer: Offer) -> None:
         """Have another part of the gateway answer calls of a name."""
@@ -94,6 +96,8 @@ class Calls:
         match call.name:
             case "command":
                 return await self._command(call)
+            case "command_all":
+                return await self._command_all(call)
             case "notify":
                 return await self._notify(call)
             case "ask":
@@ -111,15 +115,8 @@ class Calls:
         run = call.run
         if run.robot is None:
             raise PayloadError(f"{run.skill} commands a robot but its subtask names none")
-        verb = str(call.args.get("verb", ""))
-        given: object = call.args.get("args") or {}
-        if not isinstance(given, dict):
-            raise PayloadError(f"the arguments of {verb[:40]!r} are not a table")
-        args = cast("dict[str, Any]", given)
         timeout_s = _timeout(call.args.get("timeout_s", 60.0))
-        command = RobotCommand(
-            id=_effect(call), verb=verb, args=args, task=run.task, subtask=run.subtask, attempt=run.attempt
-        )
+        command = _order(call, call.args.get("args") or {})
         # The same id of an earlier attempt: a robot that drives it already is joined, one that has done it answers.
         begun = run.attempt > 1 or run.resume is not None
         deadline = _Deadline(timeout_s)
@@ -135,12 +132,45 @@ class Calls:
                 # Its task hears of the stop or lease as well, and ends this run; its next attempt does the rest.
                 await self._until_free(call, run.robot, deadline.at)
             if reply.failure.code != "busy" or left <= BUSY_RETRY_S:
-                error = from_code(reply.failure.code, reply.failure.message, reply.failure.remedy)
-                if type(error) is SwiftbotError:
-                    error = RobotError(reply.failure.message, remedy=reply.failure.remedy)
-                raise error
+                raise _error(reply.failure)
             self._on_wait(call, f"waits for {run.robot}: {reply.failure.message}")
             await asyncio.sleep(BUSY_RETRY_S)
+
+    async def _command_all(self, call: Call) -> dict[str, Any]:
+        """Have several robots of a joint skill do a verb together: all of them, or none any longer."""
+        run = call.run
+        given: object = call.args.get("robots")
+        robots = (run.robot, *run.others) if run.robot is not None else ()
+        if not isinstance(given, dict) or not given or not given.keys() <= {*robots}:
+            raise PayloadError(
+                f"{run.skill} commands robots that are not its own: {', '.join(robots) or 'it has none'}"
+            )
+        orders = {robot: _order(call, args) for robot, args in cast("dict[str, object]", given).items()}
+        timeout_s = _timeout(call.args.get("timeout_s", 60.0))
+        begun = run.attempt > 1 or run.resume is not None
+
+        async def one(robot: str) -> dict[str, Any]:
+            sent = self._orders(robot, orders[robot], CHOSEN - run.params.keys(), begun)
+            reply = await self._drive(call, robot, sent, _Deadline(timeout_s), begun=begun)
+            if reply.failure is not None:
+                raise _error(reply.failure)
+            return _answer(reply)
+
+        give_up = time.monotonic() + timeout_s
+        try:
+            return await self._together.run(
+                tuple(orders),
+                one,
+                act=f"{_effect(call)}~{run.attempt}",
+                give_up=give_up,
+                on_wait=lambda note: self._on_wait(call, note),
+            )
+        except SwiftbotError:
+            for robot in orders:
+                if await self._was_stopped(robot, HEARD_S / len(orders)):
+                    # As for one robot: its task hears of the stop as well, and its next attempt does the rest.
+                    await self._until_free(call, robot, give_up)
+            raise
 
     async def _drive(
         self, call: Call, robot: str, command: RobotCommand, deadline: "_Deadline", *, begun: bool
@@ -188,9 +218,9 @@ class Calls:
             self._on_wait(call, f"waits for {robot}: {why}")
             await asyncio.sleep(BUSY_RETRY_S)
 
-    async def _was_stopped(self, robot: str) -> bool:
+    async def _was_stopped(self, robot: str, heard_s: float = HEARD_S) -> bool:
         """Whether a command was ended by a soft stop or a lease, of which the robot may have heard first."""
-        until = time.monotonic() + HEARD_S
+        until = time.monotonic() + heard_s
         while not self._hindrance(robot):
             if time.monotonic() >= until:
                 return False
@@ -303,6 +333,27 @@ class _Effect(Struct):
 
 def _effect(call: Call) -> str:
     return f"{call.run.task}/{call.run.subtask}/{call.number}"
+
+
+def _order(call: Call, args: object) -> RobotCommand:
+    """Return the command that a handler asks for; the same id in each attempt."""
+    run, verb = call.run, str(call.args.get("verb", ""))
+    if not isinstance(args, dict):
+        raise PayloadError(f"the arguments of {verb[:40]!r} are not a table")
+    return RobotCommand(
+        id=_effect(call),
+        verb=verb,
+        args=cast("dict[str, Any]", args),
+        task=run.task,
+        subtask=run.subtask,
+        attempt=run.attempt,
+    )
+
+
+def _error(failure: Failure) -> SwiftbotError:
+    """Return what a robot could not do as an error."""
+    error = from_code(failure.code, failure.message, failure.remedy)
+    return RobotError(failure.message, remedy=failure.remedy) if type(error) is SwiftbotError else error
 
 
 def _answer(reply: RobotReply) -> dict[str, Any]:

@@ -82,6 +82,7 @@ class Context(Surroundings):
     Attributes:
         params: The subtask's parameters.
         robot: The robot it is bound to, or None.
+        robots: All its robots, more than one in a joint skill.
         inputs: Results of the subtasks it comes after, by subtask id.
         attempt: 1 for the first try.
         resume: The last checkpoint of the attempts before, or None.
@@ -100,6 +101,7 @@ class Context(Surroundings):
         self._link = link
         self.params: dict[str, Any] = order.get("params") or {}
         self.robot: str | None = order.get("robot")
+        self.robots: tuple[str, ...] = (self.robot, *(order.get("others") or ())) if self.robot else ()
         self.inputs: dict[str, dict[str, Any]] = order.get("inputs") or {}
         self.attempt: int = int(order.get("attempt", 1))
         self.resume: dict[str, Any] | None = order.get("resume")
@@ -117,6 +119,19 @@ class Context(Surroundings):
             CallError: the robot did not, with the reason.
         """
         return self._dict(self._link.ask("command", {"verb": verb, "timeout_s": timeout_s, "args": args}))
+
+    def command_all(
+        self, verb: str, robots: dict[str, dict[str, Any]], timeout_s: float = 60
+    ) -> dict[str, dict[str, Any]]:
+        """Have several of its robots do `verb` at the same time, each with its arguments; returns their answers.
+
+        None is sent before all can be commanded; when one fails, is lost or stopped, the others hold.
+
+        Raises:
+            CallError: one of them did not, with the reason and what became of the others.
+        """
+        answers = self._link.ask("command_all", {"verb": verb, "timeout_s": timeout_s, "robots": robots})
+        return {robot: self._dict(answer) for robot, answer in self._dict(answers).items()}
 
     def notify(self, to: str, text: str) -> dict[str, Any]:
         """Send a message to a person."""

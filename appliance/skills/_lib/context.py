@@ -34,6 +34,7 @@ class Context(Surroundings, Protocol):
 
     params: dict[str, Any]
     robot: str | None
+    robots: tuple[str, ...]
     inputs: dict[str, dict[str, Any]]
     attempt: int
     resume: dict[str, Any] | None
@@ -47,6 +48,12 @@ class Context(Surroundings, Protocol):
 
     def command(self, verb: str, timeout_s: float = 60, **args: Any) -> dict[str, Any]:
         """Have the robot do `verb`; files of the answer are bytes in `answer["blobs"][name]`."""
+        ...
+
+    def command_all(
+        self, verb: str, robots: dict[str, dict[str, Any]], timeout_s: float = 60
+    ) -> dict[str, dict[str, Any]]:
+        """Have several of its robots do `verb` at the same time; all of them, or none any longer."""
         ...
 
     def notify(self, to: str, text: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ repeated attempt must meet its own earlier goto, nothing else. A robot that flie
 somewhere from the ground.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from . import params, paths
@@ -31,11 +31,15 @@ class State(NamedTuple):
 
 def state(ctx: Context) -> State:
     """Ask the robot where it is; ctx.Fail when it does not know."""
-    info = ctx.command("state", timeout_s=10)
+    return read_state(ctx, str(ctx.robot), ctx.command("state", timeout_s=10))
+
+
+def read_state(ctx: Context, robot: str, info: Mapping[str, Any]) -> State:
+    """Return where a robot is by its answer to `state`; ctx.Fail when it does not know."""
     pose = params.table(info.get("pose"))
     if not isinstance(info.get("pose"), dict):
         raise ctx.Fail(
-            f"{ctx.robot} does not know where it is", "wait for its position fix, then try again", retryable=True
+            f"{robot} does not know where it is", "wait for its position fix, then try again", retryable=True
         )
     return State(
         float(pose.get("x", 0.0)),
@@ -104,7 +108,7 @@ def go(
         `pose` at the end, `path_m`, `waypoints`.
     """
     before = state(ctx)
-    altitude = _altitude(ctx, before, goals)
+    altitude = altitude_for(ctx, str(ctx.robot), before, goals)
     here: paths.Point = (before.x, before.y)
     way: list[paths.Point] = []
     waypoints: list[dict[str, float]] = []
@@ -131,7 +135,7 @@ def go(
     return {"pose": end, "path_m": round(metres, 2), "waypoints": waypoints}
 
 
-def _altitude(ctx: Context, before: State, goals: Sequence[Spot]) -> float | None:
+def altitude_for(ctx: Context, robot: str, before: State, goals: Sequence[Spot]) -> float | None:
     """Return the height to fly at, None where the robot is to choose: it drives, or takes off first."""
     limit = float(ctx.site.get("altitude_limit_m", 60.0))
     for goal in goals:
@@ -142,7 +146,7 @@ def _altitude(ctx: Context, before: State, goals: Sequence[Spot]) -> float | Non
         if goal.z > AIRBORNE_M and not before.flies:
             raise ctx.CallError(
                 "precondition",
-                f"{goal.name} is {goal.z:g} m up and {ctx.robot} does not fly",
+                f"{goal.name} is {goal.z:g} m up and {robot} does not fly",
                 "send a robot that flies",
             )
     return min(before.z, limit) if before.flies and before.z > AIRBORNE_M else None

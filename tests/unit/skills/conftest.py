@@ -46,6 +46,8 @@ class FakeContext:
     def __init__(self, scratch: Path, **params: Any) -> None:
         self.params: dict[str, Any] = params
         self.robot: str | None = "robot_1"
+        self.robots: tuple[str, ...] = ("robot_1",)
+        self.poses: dict[str, dict[str, float]] = {}
         self.inputs: dict[str, dict[str, Any]] = {}
         self.attempt = 1
         self.site: dict[str, Any] = msgspec.to_builtins(load_site("warehouse"))
@@ -90,6 +92,17 @@ class FakeContext:
                 return {"blobs": {f"frame-{number:03d}.jpg": draw(kind="JPEG") for number in range(count)}}
             case _:
                 return {"did": verb}
+
+    def command_all(
+        self, verb: str, robots: dict[str, dict[str, Any]], timeout_s: float = 60
+    ) -> dict[str, dict[str, Any]]:
+        """Note the command and have each robot do it at once, from where the test has put it (`poses`)."""
+        assert timeout_s > 0
+        assert set(robots) <= set(self.robots)
+        self.commands.append((verb, msgspec.json.decode(msgspec.json.encode(robots))))
+        if verb == "goto":
+            self.poses |= {robot: dict(args["waypoints"][-1]) for robot, args in robots.items()}
+        return {robot: dict(self.info) | {"pose": self.poses.get(robot)} for robot in robots}
 
     def notify(self, to: str, text: str) -> dict[str, Any]:
         """Note the notice."""
