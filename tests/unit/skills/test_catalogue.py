@@ -20,6 +20,7 @@ WITH_HANDLER = {
     "encode_clip", "classify_action", "preprocess_audio", "transcribe", "correct_text",
     "clean", "cut", "fasten", "unfasten", "pour", "push", "follow", "localize", "measure", "scan_thermal",
     "record_audio", "map_area", "explore", "split_area", "merge_maps", "compare", "inspect", "match_scene",
+    "rendezvous", "form_up",
 }  # fmt: skip
 MODULES_OF = {"base": set[str](), "vision": {"numpy", "PIL"}}
 MODULES_OF["learn"] = MODULES_OF["vision"] | {"torch", "av", "soundfile", "pocketsphinx"}
