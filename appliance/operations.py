@@ -490,6 +490,22 @@ async def estimate(client: FleetClient, task: TaskId) -> Outcome:
     return Outcome(value=found, text=estimate_text(found))
 
 
+OPERATIONS.append(
+    Operation(
+        name="simulate",
+        command="task simulate",
+        title="Simulate",
+        help="Run a task's plan on simulated robots of this machine: the real map, no real robot moves",
+        keys=("V",),
+        screens=("tasks", "task", "review"),
+        takes=(Argument(kind="task", name="task"),),
+        call="simulate",
+        long=True,
+        footer=False,
+    )
+)
+
+
 async def estimate_of(client: FleetClient, plan: Plan) -> Estimate:
     """Return what a plan is expected to do, by the site, the robots as they were heard last, and earlier runs."""
     rows = (await client.experience(1000)).rows

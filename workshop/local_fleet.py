@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import psutil
@@ -63,6 +64,28 @@ class Ended(Struct, frozen=True, kw_only=True):
     """Why containers and volumes were left as they are; empty when Podman did all."""
 
 
+class Simulated(Struct, frozen=True, kw_only=True):
+    """A simulated robot."""
+
+    name: str
+    kind: Literal["copter", "rover", "mobile"]
+    """The first two speak MAVLink; a mobile robot with arm and camera speaks Zenoh."""
+    start: str = ""
+    """Its home, a place or a point "x, y"; empty: the usual one of its kind."""
+    spot: int = 0
+    at: str = ""
+    """Where it stands at first, a point "x, y"; empty: at home."""
+    battery_percent: float = 100.0
+    holding: str = ""
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Those of `swiftbot sim` that both kinds have."""
+        given = {"--start": self.start, "--at": self.at}
+        texts = (each for name, text in given.items() if text for each in (name, text))
+        return (*texts, "--spot", str(self.spot), "--battery", f"{self.battery_percent:g}")
+
+
 class Order(Struct, frozen=True, kw_only=True):
     """What to start."""
 
@@ -71,6 +94,8 @@ class Order(Struct, frozen=True, kw_only=True):
     gateways: int = 3
     mavlink: int = 1
     zenoh: int = 1
+    robots: tuple[Simulated, ...] = ()
+    """Simulated robots by name, instead of numbers of copters and mobile robots."""
     site: str = "warehouse"
     skills: tuple[Path, ...] = ()
     """Folders with further skills, beside those that `base` names."""
@@ -83,6 +108,13 @@ class Order(Struct, frozen=True, kw_only=True):
     """Whether everybody gets keys, from an authority that is made for it."""
     base: GatewayConfig | None = None
     """Configuration that the gateways' own are made from."""
+
+    @property
+    def simulated(self) -> tuple[Simulated, ...]:
+        """All its robots."""
+        drones = (Simulated(name=f"drone_{at + 1}", kind="copter", spot=at) for at in range(self.mavlink))
+        rovers = (Simulated(name=f"rover_{at + 1}", kind="mobile", spot=at) for at in range(self.zenoh))
+        return self.robots or (*drones, *rovers)
 
     def pool_of(self, gateway: str) -> PoolConfig:
         """The pool of one gateway."""
@@ -116,11 +148,13 @@ async def up(order: Order, *, progress: Progress, timeout_s: float = 60.0) -> Fl
         raise ConfigError(f"{order.gateways} gateways", remedy="a local fleet has 1 to 16")
     if not 0 <= order.mavlink <= MOST_DRONES:
         raise ConfigError(f"{order.mavlink} MAVLink vehicles", remedy=f"a local fleet has 0 to {MOST_DRONES}")
-    if order.secured and order.zenoh:
+    if order.secured and any(each.kind == "mobile" for each in order.simulated):
         raise ConfigError(
             "simulated Zenoh robots share a world on keys that no role may use",
             remedy="leave them out of a secured fleet",
         )
+    if len(order.robots) > OWN_PROCESS:
+        raise ConfigError(f"{len(order.robots)} robots by name", remedy=f"at most {OWN_PROCESS} can be named")
     load_catalogue(order.skills)  # so that a mistake in a manifest is reported here, and not in each gateway's log
     directory = order.directory
     try:
@@ -164,17 +198,17 @@ class _Starting:
         ports = [free_port() for _ in range(order.gateways)]
         endpoints = tuple(f"{'tls' if order.secured else 'tcp'}/127.0.0.1:{port}" for port in ports)
         names = tuple(f"gw-{number + 1}" for number in range(order.gateways))
-        udp_ports = [free_port(socket.SOCK_DGRAM) for _ in range(order.mavlink)]
-        drones = tuple(f"drone_{number + 1}" for number in range(order.mavlink))
-        rovers = tuple(f"rover_{number + 1}" for number in range(order.zenoh))
+        mobile = [each for each in order.simulated if each.kind == "mobile"]
+        vehicles = [each for each in order.simulated if each.kind != "mobile"]
+        udp_ports = [free_port(socket.SOCK_DGRAM) for _ in vehicles]
         if order.secured:
             hosts = dict.fromkeys(names, "127.0.0.1")
             keyring.issue(keys_folder(directory), order.fleet, gateways=hosts)
         for index, name in enumerate(names):
             links = tuple(
-                MavlinkLink(listen=f"udp://127.0.0.1:{udp_ports[drone]}", names={str(drone + 1): drones[drone]})
-                for drone in range(order.mavlink)
-                if drone % order.gateways == index
+                MavlinkLink(listen=f"udp://127.0.0.1:{udp_ports[at]}", names={str(at + 1): vehicle.name})
+                for at, vehicle in enumerate(vehicles)
+                if at % order.gateways == index
             )
             config = self._config(names, endpoints, index, links, record_dir)
             path = directory / name / "gateway.toml"
@@ -184,47 +218,25 @@ class _Starting:
                 keyring.sign_parts(keys_folder(directory), config)
             self._spawn(name, "gateway", "--config", str(path))
         self._spawn("recorder", "record", "--config", str(directory / names[0] / "gateway.toml"))
-        together = len(drones) > OWN_PROCESS
-        for name, numbers in (
-            [(DRONES, range(len(drones)))] if together else [(drone, [at]) for at, drone in enumerate(drones)]
-        ):
-            self._spawn(
-                name,
-                "sim",
-                "mavlink",
-                *(each for at in numbers for each in ("--to", f"udp://127.0.0.1:{udp_ports[at]}")),
-                "--system",
-                str(numbers[0] + 1),
-                "--spot",
-                str(numbers[0]),
-                "--site",
-                order.site,
-                "--rate",
-                str(order.sim_rate),
-            )
-        for number, rover in enumerate(rovers):
-            self._spawn(
-                rover,
-                "sim",
-                "zenoh",
-                "--name",
-                rover,
-                "--spot",
-                str(number),
-                "--fleet",
-                order.fleet,
-                *(each for endpoint in endpoints for each in ("--connect", endpoint)),
-                "--site",
-                order.site,
-                "--rate",
-                str(order.sim_rate),
-            )
+        moving = ("--site", order.site, "--rate", str(order.sim_rate))
+        if len(vehicles) > OWN_PROCESS:
+            to = (each for port in udp_ports for each in ("--to", f"udp://127.0.0.1:{port}"))
+            self._spawn(DRONES, "sim", "mavlink", *to, "--system", "1", *moving)
+        else:
+            for at, vehicle in enumerate(vehicles):
+                link = ("--to", f"udp://127.0.0.1:{udp_ports[at]}", "--system", str(at + 1), "--kind", vehicle.kind)
+                self._spawn(vehicle.name, "sim", "mavlink", *link, *vehicle.options, *moving)
+        connect = tuple(each for endpoint in endpoints for each in ("--connect", endpoint))
+        for robot in mobile:
+            holding = ("--holding", robot.holding) if robot.holding else ()
+            fleet = ("--name", robot.name, "--fleet", order.fleet, *connect)
+            self._spawn(robot.name, "sim", "zenoh", *fleet, *robot.options, *holding, *moving)
         state = FleetState(
             fleet=order.fleet,
             directory=str(directory),
             endpoints=endpoints,
             gateways=names,
-            robots=(*drones, *rovers),
+            robots=tuple(each.name for each in (*vehicles, *mobile)),
             record_dir=str(record_dir),
             keys=self._keys(Role.ENGINEER, keyring.BENCH),
             processes=tuple(self.processes),

@@ -90,5 +90,7 @@ class PlaneClient:
     async def close(self) -> None:
         """Disconnect."""
         self._membership.close()
-        await self.registry.close()
-        await self.session.close()
+        try:
+            await self.registry.close()
+        finally:  # also where the one who closes is interrupted
+            await self.session.close()

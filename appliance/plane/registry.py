@@ -24,7 +24,6 @@ SIGMOD 2000). A thing that has been quiet for T is published at once.
 """
 
 import asyncio
-import contextlib
 import math
 import random
 import time
@@ -507,8 +506,7 @@ class Roster:
             closer.close()
         if self._sweeping is not None:
             self._sweeping.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await asyncio.gather(self._sweeping, return_exceptions=True)
+            await asyncio.gather(self._sweeping, return_exceptions=True)
 
 
 log = structlog.get_logger(__name__)
@@ -900,5 +898,4 @@ class Registry:
         tasks = [each for each in (self._catching_up, *self._asking.values()) if each is not None]
         for task in tasks:
             task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import msgspec
+import tomli_w
 
 from appliance.errors import ConfigError
 from appliance.model import Aisle, Box, Device, Door, Person, Place, Site, SiteObject
@@ -55,6 +56,11 @@ def differs(where: str | Path, site: Site) -> str:
     except ConfigError as error:
         return f"the site's file cannot be loaded any more ({error.message}): the site from before is used"
     return "" if found == site else "the site's file has changed: the site from before is used until a restart"
+
+
+def site_text(site: Site) -> str:
+    """Return a site as a TOML file has it."""
+    return tomli_w.dumps(msgspec.to_builtins(site))
 
 
 def plain_name(name: str) -> str:

@@ -65,6 +65,7 @@ from appliance.tui.subscriptions import FleetView, View, take_own_log
 from appliance.tui.task_view import state_cell
 from appliance.tui.widgets import Lines
 from appliance.tui.widgets.dialogs import ConfirmDialog, HelpDialog, TextDialog
+from appliance.tui.widgets.simulation import SimulationDialog, command_of
 
 SCREENS: dict[str, type[FleetScreen]] = {
     "overview": OverviewScreen,
@@ -571,6 +572,16 @@ class SwiftbotApp(App[None], inherit_bindings=False):
             record = min(waiting, key=lambda each: (each.created_ns, each.id))
             self.notify(f"this is the plan of {safe(record.id, 64)}, which waits longest", markup=False)
         self.push_screen(ReviewScreen(record.id if record is not None else given["task"]))
+
+    def do_simulate(self, given: Mapping[str, str]) -> None:
+        """Run the plan of a task on simulated robots, and show how it goes."""
+        task = given["task"]
+        try:
+            command = command_of(task, self.view.orders.endpoint)
+        except SwiftbotError as error:
+            self.tell(error)
+        else:
+            self.push_screen(SimulationDialog(task, command))
 
     def do_takeover(self, given: Mapping[str, str]) -> None:
         """Take a robot over, after asking."""

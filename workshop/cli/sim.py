@@ -3,12 +3,13 @@
 import asyncio
 from typing import Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import App, Parameter, validators
 
 from appliance import logs
 from appliance.cli.common import DAEMONS, HERE, Where
 from appliance.cli.daemons import until_signalled
 
+Percent = Annotated[float, Parameter(validator=validators.Number(gte=0, lte=100))]
 sim_app = App(name="sim", help="Simulated robots.", group=DAEMONS)
 
 
@@ -29,6 +30,8 @@ def mavlink(
     rate: float = 1.0,
     start: str = "home",
     spot: int = 0,
+    at: str = "",
+    battery: Percent = 100.0,
     kind: Literal["copter", "rover"] = "copter",
     parameter: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     drop: float = 0.0,
@@ -47,8 +50,10 @@ def mavlink(
         system: MAVLink system id, 1 to 255, of the first vehicle; the others count on.
         site: Built-in site or site file.
         rate: How many times faster than real it moves.
-        start: Place it starts at.
+        start: Its home, a place or a point "x, y".
         spot: Which spot beside it, nearest first, of the first vehicle; 0 is the place itself.
+        at: Where it stands at first, a point "x, y"; at home if not given.
+        battery: Percent.
         kind: A multirotor or a rover.
         parameter: NAME=VALUE of its autopilot that differ from the usual, such as SIM_WIND_SPD=6 or FENCE_ENABLE=1.
         drop: Share of frames that its link loses, each way.
@@ -72,6 +77,8 @@ def mavlink(
             streams=streams,
             start=start,
             spot=spot + number,
+            at=at,
+            battery_percent=battery,
             kind=kind,
             parameters=read_parameters(parameter),
             drop=drop,
@@ -98,7 +105,9 @@ def zenoh(
     rate: float = 1.0,
     start: str = "charger",
     spot: int = 0,
-    battery: float = 100.0,
+    at: str = "",
+    battery: Percent = 100.0,
+    holding: str = "",
     where: Where = HERE,
 ) -> int:
     """Simulate a mobile robot with arm and camera that speaks Zenoh.
@@ -107,9 +116,11 @@ def zenoh(
         name: Its name in the roster.
         site: Built-in site or site file.
         rate: How many times faster than real it moves.
-        start: Place it starts at.
+        start: Its home, a place or a point "x, y".
         spot: Which spot beside it, nearest first; 0 is the place itself.
-        battery: Its charge at first, %.
+        at: Where it stands at first, a point "x, y"; at home if not given.
+        battery: Percent.
+        holding: What it has in its hand at first.
         where: The fleet.
     """
     from appliance.skills.sites import load_site
@@ -125,7 +136,9 @@ def zenoh(
         rate=rate,
         start=start,
         spot=spot,
+        at=at,
         battery_percent=battery,
+        holding=holding,
     )
 
     async def go() -> None:

@@ -20,10 +20,12 @@ from appliance.robots.mavlink import dialect
 from appliance.robots.mavlink.dialect import Codec, Frame, Message
 from appliance.robots.mavlink.links import Link, open_link
 from appliance.robots.mavlink.signing import Signer, read_key
+from appliance.skills._lib import coordinates
 from workshop.robots.air import Air, Channel
 from workshop.robots.autopilot import AnyAutopilot
 from workshop.robots.components import Component, SimCamera, SimGimbal
 from workshop.robots.copter import SimCopter
+from workshop.robots.flight import Point
 from workshop.robots.rover import SimRover
 from workshop.robots.telemetry import STREAMS_HZ, telemetry
 
@@ -48,9 +50,11 @@ class VehicleSettings(Struct, frozen=True, kw_only=True):
     system: int = 1
     site: Site = field(default_factory=Site)
     start: str = "home"
+    """Its home, a place or a point "x, y"; the site's origin where the site has no places."""
     spot: int = 0
     """Beside it: 0 is the place itself."""
-    """Place it starts at, and its home; the site's origin where there is no such place."""
+    at: str = ""
+    """Where it stands at first, a point "x, y"; empty: at home."""
     rate: float = 1.0
     """How many times faster than real it moves."""
     streams: float = 1.0
@@ -98,13 +102,15 @@ _SPOT_M = 2.0
 
 
 def start_point(site: Site, start: str, spot: int = 0) -> tuple[float, float]:
-    """Return where a robot starts; ConfigError for a place the site does not have.
+    """Return where a robot starts, a place or a point "x, y"; ConfigError for a place the site does not have.
 
     `spot`: 0 is the place itself, the others are round it, nearest first, side by side and clear of obstacles; where
     there are no more, it is counted on from the first.
     """
     place = site.find(start)
     if place is None:
+        if (point := coordinates.read(start)) is not None:
+            return point[:2]
         if site.places:
             known = ", ".join(sorted(site.places))
             raise ConfigError(f"start {start!r} is no place of site {site.name}", remedy=f"known places: {known}")
@@ -168,6 +174,9 @@ def make_vehicle(settings: VehicleSettings) -> AnyAutopilot:
             known = ", ".join(sorted(vehicle.parameters.values))
             raise ConfigError(f"a simulated {settings.kind} has no parameter {name!r}", remedy=f"known: {known}")
         vehicle.parameters.values[name] = float(value)
+    if settings.at:
+        x, y = start_point(settings.site, settings.at)
+        vehicle.flight.position = Point(x - vehicle.home[0], y - vehicle.home[1], 0.0)
     return vehicle
 
 

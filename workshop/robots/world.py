@@ -168,6 +168,13 @@ class World:
         """Put the thing into the robot's hand; returns the change to tell the others."""
         return self._change(thing, robot, holder=robot)
 
+    def load(self, robot: str, name: str, pose: Pose) -> Thing:
+        """Have a robot hold a thing, one that is new here if need be; returns the change to tell the others."""
+        thing = self._things.setdefault(
+            words(name), Thing(name=name, colour=words(name).split(" ")[0], size=0.4, x=pose.x, y=pose.y)
+        )
+        return self.pick(robot, thing)
+
     def check_reach(self, robot: str, name: str, pose: Pose, *, what: str) -> Thing:
         """Return the thing of that name that the arm reaches, or holds; RobotFailure says why not."""
         thing = self.find(name, pose.x, pose.y)

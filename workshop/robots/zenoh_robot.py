@@ -79,9 +79,13 @@ class RobotSettings(Struct, frozen=True, kw_only=True):
     """Endpoints of gateways; the next is taken when one is gone."""
     site: Site = field(default_factory=Site)
     start: str = "charger"
-    """Place it starts at, and its home; the site's origin where the site has no places."""
+    """Its home, a place or a point "x, y"; the site's origin where the site has no places."""
     spot: int = 0
     """Beside it: 0 is the place itself."""
+    at: str = ""
+    """Where it stands at first, a point "x, y"; empty: at home."""
+    holding: str = ""
+    """What it has in its hand at first."""
     rate: float = 1.0
     """How many times faster than real it moves."""
     battery_percent: float = 100.0
@@ -90,6 +94,8 @@ class RobotSettings(Struct, frozen=True, kw_only=True):
         """Raise ConfigError or PayloadError for what cannot be simulated."""
         check_name(self.name, "robot")
         start_point(self.site, self.start, self.spot)
+        if self.at:
+            start_point(self.site, self.at)
         if not (math.isfinite(self.rate) and 0.0 < self.rate <= 100.0):
             raise ConfigError(f"rate {self.rate:g}", remedy="use more than 0, at most 100")
         if not plausible_battery(self.battery_percent):
@@ -135,7 +141,9 @@ class Rover:
         self.name = settings.name
         self.world = World(settings.site)
         self.home = start_point(settings.site, settings.start, settings.spot)
-        self.driving = Driving(*self.home, battery_percent=settings.battery_percent)
+        at = start_point(settings.site, settings.at) if settings.at else self.home
+        self.driving = Driving(*at, battery_percent=settings.battery_percent)
+        self._holding = settings.holding
         self.refused: dict[str, int] = {}
         self._speaker = f"{time.time_ns():020d}-{secrets.token_hex(4)}"
         self._older = ""
@@ -192,6 +200,8 @@ class Rover:
             await self._catch_up()
             if not await self._named_alone(stop):
                 return
+            if self._holding:
+                self._announce(self.world.load(self.name, self._holding, self.driving.pose))
             for closer in (
                 session.serve(keys(WORLD_OF, self.name), self._tell_world),
                 session.serve(keys(keyspace.COMMAND, self.name), self.desk.handle, signers=keyspace.COMMAND.asks),
