@@ -32,10 +32,11 @@ from appliance.connection import FleetConnection
 from appliance.deploy import host
 from appliance.deploy.layout import Layout
 from appliance.deploy.upgrade import JOURNAL, Journal, Step
-from appliance.errors import ConfigError, Exit, RefusedError, SwiftbotError, UnreachableError
+from appliance.errors import ConfigError, Exit, PrerequisiteError, RefusedError, SwiftbotError, UnreachableError
 from appliance.model import ContainerInfo, GatewayStatus, RobotInfo
 from appliance.model.recorder_api import RecorderStatus
 from appliance.record import remote_control
+from workshop import local_fleet
 
 from .test_console_markup import filled
 
@@ -178,7 +179,11 @@ def fleet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, bo
         text, refuses = said[-1]
         return [] if refuses else [filled(RecorderStatus, text)]
 
+    async def none_starts(*_: Any, **__: Any) -> None:
+        raise PrerequisiteError(said[-1][0], remedy="set it up")
+
     monkeypatch.setattr(remote_control, "trigger", trigger)
+    monkeypatch.setattr(local_fleet, "up", none_starts)
     # Nobody's releases are changed by a test that runs as root: upgrade and rollback refuse this machine's own.
     monkeypatch.setattr(releases, "os", SimpleNamespace(getuid=lambda: 1000, environ=os.environ))
     monkeypatch.setattr(FleetConnection, "open", lambda *_: pytest.fail("a command connects by itself"))
