@@ -146,7 +146,7 @@ async def dry_run(
         skills: folders with further skills, as the real gateways have them.
         rate: how many times faster than real the robots move.
         limit_s: after so long it ends as it stands.
-        progress: told what is being done and what each subtask does.
+        progress: takes lines on what is being done and what each subtask does.
 
     Raises:
         RefusedError: there is no plan, or no robot of it can be simulated.
@@ -199,15 +199,15 @@ def _map_file(site: Site, folder: Path) -> str:
 
 async def _followed(client: FleetClient, task: str, limit_s: float, progress: Progress) -> tuple[TaskRecord, str]:
     """Follow a task to its end, or to the limit; returns its last record and why it did not go well."""
-    told: dict[str, tuple[SubtaskState, str]] = {}
+    shown: dict[str, tuple[SubtaskState, str]] = {}
     record = await client.task(task)
     try:
         async with asyncio.timeout(limit_s):
             async for record in client.watch(task):
                 for each in record.subtasks:
                     news = (each.state, each.note)
-                    if told.get(each.subtask.id, (SubtaskState.WAITING, "")) != news:
-                        told[each.subtask.id] = news
+                    if shown.get(each.subtask.id, (SubtaskState.WAITING, "")) != news:
+                        shown[each.subtask.id] = news
                         note = f": {each.note}" if each.note else ""
                         progress(f"simulation: {each.subtask.id} {each.subtask.skill} {each.state}{note}")
     except TimeoutError:

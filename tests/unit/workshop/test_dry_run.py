@@ -32,7 +32,7 @@ def plan(*robots: str) -> Plan:
 
 @given(NAMES, st.data())
 def test_robots_of_the_plan_come_first(names: set[str], data: st.DataObject) -> None:
-    """All of them are simulated or it is refused, others as far as there is room; who is left out is told."""
+    """All of them are simulated or it is refused, others as far as there is room; who is left out is named."""
     named = data.draw(st.sets(st.sampled_from(sorted(names))))
     robots = {name: robot(name) for name in names}
     if len(named) > MOST_ROBOTS:
@@ -69,7 +69,7 @@ def test_a_robot_is_simulated_as_it_is() -> None:
 
 
 def test_a_robot_without_position_is_not_guessed() -> None:
-    """One of the plan: refused, with what does without; another: told."""
+    """One of the plan: refused, with what does without; another: named."""
     robots = {"rover_1": robot("rover_1", pose=None), "rover_2": robot("rover_2")}
     with pytest.raises(RefusedError, match="position is not known") as refused:
         simulated(plan("rover_1"), robots, SITE)
