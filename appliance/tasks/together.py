@@ -2,7 +2,7 @@
 
 None is sent before every robot is there, may be commanded and is leased to this run: of two runs that want the same
 robots one waits, at whatever gateway. Once they are sent all robots are watched. When one fails, is lost, stopped or
-taken over, the others are told to hold; when the run ends, or its gateway lets go, their commands end.
+taken over, the others hold; when the run ends, or its gateway lets go, their commands end.
 """
 
 import asyncio
