@@ -1036,7 +1036,8 @@ RuleId = Annotated[str, Kind("rule", "Rule ID, as `swiftbot rules list` shows it
 
 
 @operation(
-    "rules add", name="add-rule", title="Add rule", role=Role.OPERATOR, audit="rule_add", footer=False, call="rule",
+    "rules add", name="add-rule", title="Add rule", screens=("schedules",), role=Role.OPERATOR, audit="rule_add",
+    footer=False, call="rule",
     danger='Add the standing rule "{text}"? Plans against it are refused, and subtasks that have not begun wait.',
 )  # fmt: skip
 async def add_rule(client: FleetClient, text: RuleText) -> Outcome:
