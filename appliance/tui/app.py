@@ -33,7 +33,7 @@ from appliance.llm.rule_words import rule_words
 from appliance.llm.stop_words import stop_request
 from appliance.llm.training_words import training_request
 from appliance.model import Approval, Site, TaskRecord
-from appliance.model.alerts import Alert, Subject
+from appliance.model.alerts import Alert, AlertLevel, Subject
 from appliance.model.messages import enums_open
 from appliance.model.roles import lacks
 from appliance.operations import STOP_IN_WORDS, Operation, read_rule
@@ -179,6 +179,8 @@ class SwiftbotApp(App[None], inherit_bindings=False):
         """Command lines written before."""
         self.unlocked = self.config.write and view.steerable
         """Whether what changes the fleet is allowed."""
+        self._signalled: set[str] = set()
+        """Critical alerts that the terminal has rung for, or would have."""
         self.under_way: dict[str, None] = {}
         """Orders that have not been answered yet, as command lines."""
         self.wanted_task = ""
@@ -214,12 +216,35 @@ class SwiftbotApp(App[None], inherit_bindings=False):
         # While the app ends, the timer may still fire when parts of the screen are gone.
         with contextlib.suppress(NoMatches):
             self.draw()
+        self.signal_alerts()
 
     def draw(self, *, force: bool = False) -> None:
         """Draw what is new on the screen that is seen; the others wait until they are."""
         self.view.sync()
         if (front := self.front) is not None:
             front.flush(force=force)
+
+    def signal_alerts(self) -> None:
+        """Have the terminal ring, or notify the desktop, of critical alerts that were not there before."""
+        open_now = {
+            each.id: each
+            for each in self.view.store.alerts.values()
+            if each.level is AlertLevel.CRITICAL and each.acked is None
+        }
+        new = [each for name, each in open_now.items() if name not in self._signalled]
+        self._signalled = set(open_now)
+        if not new or not self.view.steerable:
+            return  # a recorded log calls nobody
+        if "bell" in self.config.signals:
+            self.write_terminal("\a")
+        if "notification" in self.config.signals:
+            more = f" and {len(new) - 1} more" if len(new) > 1 else ""
+            self.write_terminal(f"\x1b]9;{safe(f'SwiftBot {self.view.fleet}: {new[0].what}{more}', 200)}\a")
+
+    def write_terminal(self, sequence: str) -> None:
+        """Send a control sequence to the terminal."""
+        if self._driver is not None and not self.is_headless:
+            self._driver.write(sequence)
 
     def delay_update(self, delay: float = 0.05) -> None:
         """Hold painting back while screens change; shorter than Textual does, since ours are drawn at once."""

@@ -35,6 +35,9 @@ class TuiConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     glyphs: Literal["auto", "unicode", "ascii"] = "auto"
     """Signs that are drawn; `auto`: ASCII on the console of Linux (`TERM=linux`), on a `vt100` and the like, and where
     the locale is not UTF-8."""
+    signals: tuple[Literal["bell", "notification"], ...] = ()
+    """What the terminal does when there is a new critical alert: ring its bell, show a notification of the desktop
+    (OSC 9, in terminals that have it); once for all that are new."""
     logs: tuple[str, ...] = ()
     """Further folders in which recorded logs are looked for, for the screen of replay."""
     animation: bool = False

@@ -3,7 +3,7 @@
 # pyright: reportArgumentType=false
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 from msgspec.structs import replace
@@ -228,3 +228,36 @@ async def test_what_is_not_answered_hides_nothing_else(missing: str) -> None:
     assert set(view.store.alerts) == ({FAILED.id} if missing == "alerts" else {ROBOT.id, GATEWAY.id})
     assert bool(list(view.store.enquiries)) == (missing != "enquiries")
     assert bool(list(view.store.closures)) == (missing != "closures")
+
+
+@pytest.mark.parametrize(
+    ("signals", "written"),
+    [
+        ((), []),
+        (("bell",), ["\a", "\a"]),
+        (
+            ("bell", "notification"),
+            [
+                "\a",
+                "\x1b]9;SwiftBot test: rover_1 is lost␛]0;x and 1 more\a",
+                "\a",
+                "\x1b]9;SwiftBot test: gw-b is lost\a",
+            ],
+        ),
+    ],
+)
+async def test_the_terminal_signals_critical_alerts_that_are_new(
+    view: "FakeView", signals: tuple[Literal["bell", "notification"], ...], written: list[str]
+) -> None:
+    """Once for all that are new, not again while they last, and nothing in an alert is obeyed by the terminal."""
+    app = SwiftbotApp(view, TuiConfig(signals=signals))
+    sent: list[str] = []
+    app.write_terminal = sent.append
+    lost = Alert(id="1", kind="k", level=AlertLevel.CRITICAL, what="rover_1 is lost\x1b]0;x", subject="robot", name="r")
+    other = replace(lost, id="2")
+    late = replace(lost, id="3", what="gw-b is lost")
+    mild = replace(lost, id="4", level=AlertLevel.WARNING)
+    for alerts in ([], [lost, other, mild], [lost, other], [lost, other, late], [late]):
+        view.store.take_alerts(alerts)
+        app.signal_alerts()
+    assert sent == written
