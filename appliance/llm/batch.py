@@ -17,7 +17,8 @@ from msgspec.structs import replace
 
 from appliance.errors import ConfigError, NotFoundError, PlanError, RecordError
 from appliance.llm.cascade import Decomposer
-from appliance.llm.preprocessing import training_refused
+from appliance.llm.preprocessing import rule_refused, training_refused
+from appliance.llm.rule_words import rule_words
 from appliance.llm.settings import LlmConfig, PlanContext, SafetyConfig
 from appliance.llm.stop_words import stop_request
 from appliance.llm.training_words import training_request
@@ -232,6 +233,8 @@ async def predicted(
         return prediction(case.id, None, "a stop, not a task", decision=Verdict.STOP, stops=stop.robots)
     if (training := training_request(case.instruction, case.robots or ())) is not None:
         return prediction(case.id, None, training_refused(training).message)
+    if (said := rule_words(case.instruction, robots or (), site)) is not None and said.rule:
+        return prediction(case.id, None, rule_refused(case.instruction).message)
     try:
         outcome = await decomposer.plan(PlanContext(instruction=case.instruction, robots=robots, site=site))
     except PlanError as error:

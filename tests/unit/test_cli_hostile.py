@@ -374,7 +374,7 @@ def test_json_is_what_its_schema_says(
     }  # fmt: skip
     options = {
         "task approve": ["--hash", "0123456789"], "robots links add": ["--connect"],
-        "schedule add": ["--every", "1h", "--name", "x"],
+        "schedule add": ["--every", "1h", "--name", "x"], "rules add": ["--place", "x"],
     }  # fmt: skip
     fleet.append(("x", False))
     arguments = given.get(command) or (["udp://x:1"] if command.startswith("robots links ") else ["x/x"]) * required

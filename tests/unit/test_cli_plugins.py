@@ -26,10 +26,12 @@ def _offered(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
 
 
 def test_the_workshop_offers_its_commands() -> None:
-    """The installed entry points add `up`, `down`, `demo`, `sim`, `bench` and `train`."""
+    """The installed entry points add `up`, `down`, `demo`, `sim`, `bench` and `train`, and `task simulate`."""
     app = App()
+    app.command(App(name="task"))
     plugins.add_to(app)
     assert set(WORKSHOP) <= set(app)
+    assert "simulate" in set(app["task"])
 
 
 def test_a_package_that_is_broken_is_named_and_the_others_stay(

@@ -14,7 +14,7 @@ from msgspec import Struct
 from rich.text import Text
 
 from appliance import cli, console, reasons
-from appliance.cli import common, plane, robots
+from appliance.cli import common, plane, robots, rules
 from appliance.client import Stopped
 from appliance.console import SafeConsole, analysis_text, experience_table, provenance_text, revision_lines, stream_line
 from appliance.errors import RefusedError
@@ -28,7 +28,9 @@ from appliance.model import (
     RobotInfo,
     SoftStop,
     TaskRecord,
+    Word,
 )
+from appliance.model.closures import Closure, Rule
 from appliance.model.plane_api import Record, RecordPlace
 from appliance.model.planner_api import Analysis
 from appliance.model.pool_api import Evicted, PoolDecision
@@ -55,6 +57,8 @@ def filled(kind: Any, text: str, depth: int = 0) -> Any:
         return arguments[0]
     if origin in (tuple, list, frozenset, dict, Mapping):
         return filled_many(origin, arguments, text, depth + 1)
+    if kind is Closure:  # of its fields not all go together
+        return Closure(kind="place", name=text, by=filled(Word, text))
     if isinstance(kind, type) and issubclass(kind, Struct):
         hints = get_type_hints(kind, include_extras=True)
         return kind(**{name: filled(hints[name], text, depth + 1) for name in kind.__struct_fields__})
@@ -88,6 +92,12 @@ def of(kind: Any, show: Callable[[Any], Any]) -> Callable[[str], Any]:
     return lambda text: show(filled(kind, text))
 
 
+def a_rule(text: str) -> Closure:
+    """Return a standing rule with a text in all its names."""
+    rule = Rule(robots=(text,), places=(text,), days=(0,), zone=text)
+    return Closure(kind="rule", name=text, by=filled(Word, text), rule=rule)
+
+
 SHOWN: dict[str, Callable[[str], Any]] = {
     "task": of(TaskRecord, console.task_table),
     "tasks": of(tuple[TaskRecord, ...], console.task_list),
@@ -107,6 +117,7 @@ SHOWN: dict[str, Callable[[str], Any]] = {
     "images": of(tuple[ImageState, ...], console.image_table),
     "robots": of(tuple[RobotInfo, ...], console.robot_table),
     "links": of(dict[str, LinkList], robots.links_tables),
+    "rules": lambda text: rules.rules_table((a_rule(text),)),
     "held records": of(list[Held], plane.held_table),
     "place": lambda text: plane.place_table(filled(Record, text), filled(RecordPlace, text), text),
     "stop": of(StopAnswer, lambda answer: Stopped(unknown=("[/red]",), answer=answer).text()),
