@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding
+from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Label, Static
 
@@ -58,9 +59,10 @@ class SimulationDialog(ModalScreen[None]):
 
     def compose(self) -> ComposeResult:
         """Make the dialog."""
-        with Pane(classes="dialog"):
+        with Vertical(classes="dialog"):
             yield Label(Text(f"Simulation of {safe(self._subject, 64)}: no real robot moves"), classes="title")
-            yield Static(id="content")
+            with Pane(id="plan-box"):
+                yield Static(id="content")
             yield Static("Esc ends it", id="hint")
 
     def on_mount(self) -> None:
