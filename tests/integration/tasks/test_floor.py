@@ -165,8 +165,13 @@ async def test_a_rover_follows_another_past_a_third(tmp_path: Path) -> None:
                 id="s1", skill="goto", robot="rover_1", params={"place": "inspection point", "speed_mps": 1.0}
             )
             for name, subtask in (("t-lead", lead), ("t-follow", follow)):
+                while "rover_1" not in seen.at:
+                    await asyncio.sleep(0.05)
+                start = seen.at["rover_1"]
                 plan = Plan(domain="navigation", subtasks=(subtask,))
                 await client.submit(TaskRequest(instruction="try", id=name, plan=plan))
+                while name == "t-lead" and math.dist(seen.at["rover_1"], start) < 0.3:
+                    await asyncio.sleep(0.05)  # else the follower may reserve the ground before it first
             states = await until_ended(client, "t-lead", "t-follow")
             assert set(states.values()) == {TaskState.SUCCEEDED}, states
             assert seen.least >= 2 * RADIUS_M
