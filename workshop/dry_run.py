@@ -171,7 +171,7 @@ async def dry_run(
         try:
             async with FleetClient(state.endpoint, operator="dry-run") as simulation:
                 accepted = await simulation.submit(
-                    TaskRequest(instruction=f"dry run of {task}", plan=plan, id=f"dry-{secrets.token_hex(4)}")
+                    TaskRequest(instruction="dry run", plan=plan, id=f"dry-{secrets.token_hex(4)}")
                 )
                 planned = await simulation.planned(accepted.id)
                 if planned.proposal is not None and planned.proposal.waits:

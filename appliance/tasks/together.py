@@ -65,8 +65,7 @@ class Together:
         """
         leases: list[Lease] = []
         try:
-            await self._until(lambda: self._lease(robots, leases), robots, give_up, on_wait)
-            await self._until(lambda: self._free(robots), robots, give_up, on_wait)
+            await self._until(lambda: self._ready(robots, leases), robots, give_up, on_wait)
             try:
                 async with asyncio.TaskGroup() as group:
                     watching = group.create_task(self._watch(robots, leases))
@@ -109,8 +108,18 @@ class Together:
             told = why
             await asyncio.sleep(LOOK_S)
 
-    async def _free(self, robots: Sequence[str]) -> str:
-        return self.against(robots)
+    async def _ready(self, robots: Sequence[str], leases: list[Lease]) -> str:
+        """Return why the robots cannot begin just now; those that are leased stay so while others are waited for."""
+        if any(each.left_s < 2 * LEASE_S / 3 for each in leases):
+            try:
+                leases[:] = await asyncio.gather(*(self._renewed(each) for each in leases))
+            except (ConflictError, RobotError) as error:
+                # Another run may have them by now: none counts before all are leased again.
+                for lease in leases:
+                    self._releasing.start(self._plane.leases.release(lease), f"release {lease.key}")
+                leases.clear()
+                return error.message
+        return await self._lease(robots, leases) or self.against(robots)
 
     async def _lease(self, robots: Sequence[str], leases: list[Lease]) -> str:
         """Lease what is not leased yet, in one order everywhere so that no two runs wait for each other."""

@@ -1,6 +1,7 @@
 """A plan on simulated robots before it is approved: `swiftbot task simulate`."""
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter, validators
@@ -47,11 +48,15 @@ def simulate(
     """
     from workshop.dry_run import dry_run
 
+    def say(text: str) -> None:
+        with contextlib.suppress(OSError):  # who has read it is gone: the simulation's fleet is removed all the same
+            console.err.print(text, markup=False, highlight=False)
+
     async def go() -> "DryRun":
         async with where.client() as client:
             return await dry_run(
                 client, task, skills=skills, rate=rate, limit_s=limit_s,
-                progress=lambda text: console.err.print(text, markup=False, highlight=False),
+                progress=say,
             )  # fmt: skip
 
     found = asyncio.run(go())

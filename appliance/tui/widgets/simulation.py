@@ -9,7 +9,9 @@ import contextlib
 import importlib.util
 import os
 import signal
+import subprocess
 import sys
+import threading
 from collections import deque
 from collections.abc import Sequence
 
@@ -55,7 +57,7 @@ class SimulationDialog(ModalScreen[None]):
         self._subject = task
         self._command = tuple(command)
         self._lines: deque[str] = deque(maxlen=MOST_LINES)
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: subprocess.Popen[bytes] | None = None
 
     def compose(self) -> ComposeResult:
         """Make the dialog."""
@@ -73,25 +75,33 @@ class SimulationDialog(ModalScreen[None]):
     async def _run(self) -> None:
         width = max(40, self.query_one(Pane).size.width - 4)
         try:
-            process = self._process = await asyncio.create_subprocess_exec(
-                *self._command,
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=asyncio.subprocess.PIPE,
-                stderr=asyncio.subprocess.STDOUT,
+            # Not asyncio's: that kills the process when the terminal UI ends, while it still removes its fleet.
+            process = self._process = subprocess.Popen(  # noqa: ASYNC220 - it begins at once
+                self._command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
                 env={**os.environ, "COLUMNS": str(width), "NO_COLOR": "1", "TERM": "dumb"},
                 start_new_session=True,  # the end of the terminal does not end it half way
             )
         except OSError as error:
             self._add(f"it cannot be started: {error.strerror}")
             return
+        waiting = threading.Thread(target=process.wait, name="simulation", daemon=True)
+        waiting.start()
+        reader = asyncio.StreamReader()
+        pipe, _ = await asyncio.get_running_loop().connect_read_pipe(
+            lambda: asyncio.StreamReaderProtocol(reader), process.stdout
+        )
         try:
-            assert process.stdout is not None  # noqa: S101 - it is a pipe
-            with contextlib.suppress(ValueError):  # a line longer than the pipe's buffer: nothing that is printed here
-                async for line in process.stdout:
+            with contextlib.suppress(ValueError):  # a line longer than the buffer: nothing that is printed here
+                async for line in reader:
                     self._add(line.decode(errors="replace").rstrip())
-            code = await process.wait()
+            await asyncio.to_thread(waiting.join)
         finally:
             self._interrupt()
+            pipe.close()
+        code = process.returncode
         self.query_one("#hint", Static).update(
             "Esc leaves" if code == 0 else f"ended with exit code {code}; Esc leaves"
         )

@@ -38,6 +38,8 @@ class Fleet:
         self.released: list[str] = []
         self.grants: dict[str, SwiftbotError] = {}
         self.notes: list[str] = []
+        self.renewed = 0
+        self.lost: SwiftbotError | None = None
         session = SimpleNamespace(keys=lambda _, robot: robot, query=self.query)
         leases = SimpleNamespace(acquire=self.acquire, release=self.release, renew=self.renew)
         registry = SimpleNamespace(robots=self.robots, lost_ns={})
@@ -65,8 +67,11 @@ class Fleet:
         self.released.append(lease.robot)
 
     async def renew(self, lease: Any, *, ttl_s: float) -> Any:
-        """Go on."""
+        """Go on, or raise what the test says."""
         assert ttl_s
+        if self.lost is not None:
+            raise self.lost
+        self.renewed += 1
         return lease
 
     async def one(self, robot: str) -> str:
@@ -137,6 +142,24 @@ async def test_none_moves_while_one_is_away_or_stopped(fleet: Fleet, away: str) 
     await asyncio.gather(doing, return_exceptions=True)
 
 
+async def test_leases_are_kept_while_a_robot_is_waited_for(fleet: Fleet) -> None:
+    """They are renewed meanwhile; one that is lost all the same is leased again before any robot moves."""
+    fleet.stopped["r3"] = "stopped by ann"
+    doing = fleet.start()
+    await fleet.until(lambda: fleet.renewed >= 2 * len(NAMES))
+    assert not fleet.released
+    fleet.lost = ConflictError("the lease on joint/r1 has ended")
+    fleet.leased.clear()
+    await fleet.until(lambda: "the lease on joint/r1 has ended" in fleet.notes)
+    assert not fleet.moving
+    fleet.lost = None
+    fleet.stopped.clear()
+    await fleet.until(lambda: fleet.moving == set(NAMES))
+    assert fleet.leased == set(NAMES)
+    doing.cancel()
+    await asyncio.gather(doing, return_exceptions=True)
+
+
 async def test_none_moves_while_another_run_has_one_of_them(fleet: Fleet) -> None:
     """Those that are leased already stay leased; where a majority of grantors is not there, nobody moves either."""
     for error in (ConflictError("leased"), UnreachableError("1 of 3 answer")):
@@ -201,6 +224,7 @@ def test_whatever_happens_no_robot_goes_on_without_the_others(events: list[tuple
             if what == "arrive":
                 fleet.done[robot].set()
                 arrived.add(robot)
+                await fleet.until(lambda: not fleet.moving & arrived)  # before anything else happens
             elif what == "cancel":
                 doing.cancel()
             elif what == "lose":
