@@ -51,6 +51,8 @@ class Closures:
         self._kept: dict[str, Closure] = {}
         self._in_force: frozenset[str] = frozenset()
         self._doubtful = asyncio.Event()
+        self._whole = False
+        """Whether all other gateways have answered once: before that, something may be out of use that is not known."""
         self._closers: list[Callable[[], None]] = []
         self._work: asyncio.Task[None] | None = None
 
@@ -156,7 +158,8 @@ class Closures:
             try:
                 self._look()
                 await self._remove_old()
-                if self._doubtful.is_set() or time.monotonic() - synced_at >= RESYNC_S:
+                resync_s = RESYNC_S if self._whole else LOOK_S
+                if self._doubtful.is_set() or time.monotonic() - synced_at >= resync_s:
                     self._doubtful.clear()
                     synced_at = time.monotonic()
                     await self.sync()
@@ -180,6 +183,7 @@ class Closures:
         for each in found.values():
             self._take(each)
         if all(answer is not None for answer in answers):
+            self._whole = True
             await self._drop({name: each for name, each in before.items() if name not in found})
         self._look()
 

@@ -121,6 +121,12 @@ class _Known(Struct, frozen=True):
         wanted = _fold(re.sub(r"^(?:the )?(?:robot |both )?(?=.)", "", name, flags=re.IGNORECASE))
         return tuple(each.id for each in self.robots if _fold(each.id) == wanted)
 
+    def named(self, text: str) -> bool:
+        """Whether a text has the name of a robot or place in it."""
+        words = text.split()
+        parts = (" ".join(words[at:end]) for at in range(len(words)) for end in range(at + 1, len(words) + 1))
+        return any(self._robot(each) or self._place(each) for each in parts)
+
     def places(self, text: str) -> tuple[str, ...]:
         """Return the places that a text names, by their names on the site."""
         return _listed(text, self._place, "place")
@@ -215,8 +221,11 @@ def _when(text: str, zone: str) -> tuple[str, _When]:
         if (unsure or unsure_end) and not (first and last and afternoon):
             raise _NoRuleError(f'"{found[0].strip(" ,")}": write hours like 06:00 and 18:00, or with am and pm')
         begin, end, text, said = begin % DAY_MIN, end or DAY_MIN, _without(text, found), True
-        if re.search(r"\bor\b", found[0]) and begin < end:
+        if (re.search(r"\bor\b", found[0]) and begin < end) or (begin, end) == (0, DAY_MIN):
             raise _NoRuleError(f'"{found[0].strip(" ,")}" is always')
+        if days and begin > end and re.search(r"\bbefore\b", found[0], re.IGNORECASE):
+            # As one rule its hours would begin on these days and end on the next ones.
+            raise _NoRuleError(f'"{found[0].strip(" ,")}": say each with its own hours as a rule of its own')
     return " ".join(text.split()).strip(" ,"), _When(begin, end, days, zone if said else "UTC", said)
 
 
@@ -293,9 +302,23 @@ _JUDGED = _words(
 )
 _NAMED = re.compile(r"[\w-]+(?: [\w-]+){0,3}")
 _INSIDE = _words(r"\b(?:to|from|into|in|at|on|of|that|which|and|or|out|up|down)\b")
+_ORDER = _words(
+    r"\b(?:go|drive|move|travel|come|head|return|roll|fly|enter|visit|use|carry|carrie|transport|pick|take|lift|fetch|grab|"
+    r"haul|land|stop|halt|freeze|abort|hold|wait|pause|photograph|film|record|inspect|scan|report|detect|find|look|place|put|"
+    r"drop|bring|deliver|push|pull|follow|charge|dock|undock|start|begin|do|work|operate|run|turn|rotate|open|close|switch|"
+    r"clean|sweep|cut|patrol|explore|map|measure|read|say|ask|tell|send|give|hand|keep|stay|leave|let|make|try|help|load|"
+    r"unload|fasten|unfasten|pour|count|check|cancel|resume|orbit|circle|hover|climb|descend)(?:e?s|d|ed|ing)?\b"
+)
+"""Orders: a thing whose name has one of them may be a second order, which no rule says."""
+_FILLER = _words(
+    r"\b(?:again|now|yet|first|last|later|all|both|every|everything|each|it|this|that|these|those|my|your|our|their|its|other|"
+    r"others|same|twice|alone|together|outside|inside|upstairs|downstairs|here|there|yourself|no|not|never|nor|neither|none|"
+    r"must|may|shall|should|can|will|anymore|longer)\b|^\d+\b|n't\b"
+)
+"""What is no part of a thing's name, so that with it the name would not be found in a plan's."""
 
 
-def _thing(text: str) -> tuple[str, ...]:
+def _thing(text: str, known: _Known) -> tuple[str, ...]:
     bare = _ARTICLE.sub("", text.strip(" ,"))
     if _ANY_THING.fullmatch(bare):
         return (ANYTHING,)
@@ -303,13 +326,22 @@ def _thing(text: str) -> tuple[str, ...]:
         raise _NoRuleError(_unknown(bare, "thing"))
     if _INSIDE.search(bare) or not _NAMED.fullmatch(bare):
         raise _NoRuleError(f'"{bare[:60]}": a rule on what is taken up names the thing alone')
+    if found := _ORDER.search(bare) or _FILLER.search(bare):
+        raise _NoRuleError(
+            f'"{found[0]}" is no part of the name of a thing: say one rule at a time, with its name alone'
+        )
+    if known.named(bare):
+        raise _NoRuleError(f'"{bare[:60]}" names a robot or place, no thing')
     if found := _JUDGED.search(bare):
         raise _NoRuleError(f'"{found[0]}" cannot be told from the name of a thing: name it, or say anything')
     return (bare.casefold(),)
 
 
-def _things(text: str) -> tuple[str, ...]:
-    return tuple(name for each in re.split(r",? (?:or|and|nor) |, ?", text) for name in _thing(each))
+def _things(text: str, known: _Known) -> tuple[str, ...]:
+    """Return the things of a list with `or`: after `and` or a comma alone a further order may follow."""
+    if re.search(r",? and |,(?!.* (?:or|nor) )", text, re.IGNORECASE):
+        raise _NoRuleError(f'"{text[:60]}": say things with "or" between them, or one rule at a time')
+    return tuple(name for each in re.split(r",? (?:or|nor) |, ?", text) for name in _thing(each, known))
 
 
 def _act(text: str, who: _Who, when: _When, known: _Known, *, bare: bool = False) -> RuleWords:
@@ -319,7 +351,7 @@ def _act(text: str, who: _Who, when: _When, known: _Known, *, bare: bool = False
         rule["places"] = known.places(found["place"])
         who = _flyers(who, found)
     elif found := _TAKE.fullmatch(text):
-        rule["things"] = _things(found["thing"])
+        rule["things"] = _things(found["thing"], known)
     elif found := _BEGIN.fullmatch(text):
         if not when.said:
             raise _NoRuleError(f'"{text}": say at which hours or days, or: swiftbot robots maintain ROBOT')

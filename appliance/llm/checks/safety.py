@@ -178,6 +178,10 @@ def involved(subtask: Subtask, context: PlanContext) -> list[str]:
     return sorted(found | {each.id for each in context.robots or () if each.id == subtask.params.get("to")})
 
 
+ALWAYS = frozenset({"land", "return_home", "hold"})
+"""Skills that a rule of hours alone keeps no robot from: one that is in the air when they begin has to come down."""
+
+
 def kept_from(subtask: Subtask, robot: str, context: PlanContext, catalogue: Catalogue) -> str:
     """Return the standing rule that keeps a robot from a subtask, in words; empty when none does.
 
@@ -202,7 +206,7 @@ def kept_from(subtask: Subtask, robot: str, context: PlanContext, catalogue: Cat
             taken = _taken(subtask, robot, catalogue)
             hit = taken != "" and any(each == ANYTHING or _is(taken, each) for each in rule.things)
         else:
-            hit = True
+            hit = subtask.skill not in ALWAYS
         if hit:
             return f"kept from it by standing rule {closure.name} ({closure.text})"
     return ""

@@ -112,6 +112,31 @@ async def test_what_cannot_be_is_refused(clock: Clock, kept: Closures) -> None:
         assert getattr(refused.value, "remedy", "")
 
 
+async def test_a_gateway_that_starts_beside_a_silent_one_asks_it_again_soon(plane: FakePlane, clock: Clock) -> None:
+    """What only that one knows to be out of use is not unknown for longer than it is silent."""
+    late = Closure(kind="place", name="gate", by=Word(by="bob", at_ns=2))
+    plane.present = {"gw-1", "gw-2"}
+    asked = 0
+
+    async def answer(_: str, __: ClosuresAsk) -> ClosureList:
+        nonlocal asked
+        asked += 1
+        if asked < 3:
+            raise UnreachableError("it does not answer")
+        return ClosureList(closures=(late,))
+
+    plane.rpc.on["closures"] = answer
+    made = of(plane, clock)
+    await made.start(lambda _, handler: handler)
+    try:
+        assert not made.places
+        with anyio.fail_after(20):
+            while not made.places:
+                await anyio.sleep(0.01)
+    finally:
+        await made.close()
+
+
 async def test_a_gateway_that_starts_learns_from_the_others(plane: FakePlane, clock: Clock) -> None:
     """Also where it holds no copy; the later word counts, and one that does not answer takes nothing away."""
     early, late = (Closure(kind="place", name="gate", by=Word(by=by, at_ns=at)) for by, at in (("ann", 1), ("bob", 2)))

@@ -245,6 +245,16 @@ async def test_a_rule_is_added_listed_and_removed(plane: FakePlane, kept: Closur
     assert "swiftbot rules list" in str(refused.value.remedy)
 
 
+@pytest.mark.parametrize(
+    ("skill", "kept"), [("takeoff", True), ("land", False), ("return_home", False), ("hold", False)]
+)
+def test_hours_leave_no_drone_in_the_air(skill: str, kept: bool, catalogue: "Catalogue") -> None:
+    """Where nothing begins at night, what ends a flight does."""
+    night = Rule(group="flying", begin_min=22 * 60, end_min=6 * 60)
+    context = PlanContext(instruction="", robots=ROBOTS, site=SITE, out_of_use=OutOfUse(rules=(standing(night),)))
+    assert bool(kept_from(step(skill, "drone_1"), "drone_1", context, catalogue)) is kept
+
+
 @pytest.mark.anyio
 async def test_the_hours_of_a_rule_begin_and_end(plane: FakePlane, kept: Closures) -> None:
     """Outside them it is listed and forbids nothing, and its record stays; parts are told when they begin and end."""

@@ -158,6 +158,36 @@ def test_what_no_rule_says_whole_is_none(text: str, why: str) -> None:
     assert why in found
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "do not carry the box and return home",
+        "do not pick up the box, inspect the gate",
+        "never carry glass and photograph dock 2",
+        "never carry the box, land",
+        "don't carry the box, stop",
+        "never carry glass, halt",
+        "never carry glass and stop rover_1",
+        "never carry glass or enter dock 2",
+        "rover_1 never carries glass and rover_2 never carries wood",
+        "never carry glass again",
+        "never carry all boxes",
+        "never carry 2 boxes",
+        "never carry these boxes",
+        "do not pick up box 1 and 2",
+        "never carry it",
+        "never go to dock 2 before 8:00 and after 18:00 on sundays",
+        "never go to dock 2 after 18:00 or before 6:00 on weekdays",
+        "never go to dock 2 after midnight",
+        "never go to dock 2 before midnight",
+    ],
+)
+def test_what_may_be_another_order_or_other_hours_is_no_rule(text: str) -> None:
+    """A second order or prohibition, a stop, words that are no part of a name, hours that begin on other days."""
+    found = rule_words(text, ROBOTS, SITE, zone=ZONE)
+    assert found is None or found.rule is None
+
+
 def test_rovers_are_no_group_where_others_stand_on_the_ground() -> None:
     """A rule for all ground robots would forbid more, one for those that are there now less."""
     arm = RobotInfo(id="arm_1", kind="zenoh")
