@@ -37,6 +37,10 @@ ASK_S = 30.0
 MOST_MARKED = 32
 """Alerts whose records are marked as delivered at one look."""
 MAX_REASON = 160
+ANSWER_S = 60.0
+"""A service that has not answered by then holds the others up no longer."""
+HOSTED = frozenset({"json", "jsons", "xml", "xmls", "form", "forms", "mailto", "mailtos"})
+"""Kinds of addresses whose host is one."""
 
 
 class Address:
@@ -44,10 +48,13 @@ class Address:
 
     def __init__(self, line: int, plugin: "NotifyBase") -> None:
         self._plugin = plugin
-        host = getattr(plugin, "host", None) or ""
-        self.name = f"line {line} ({' '.join(filter(None, (str(plugin.service_name), str(host))))})"
+        host = str(getattr(plugin, "host", None) or "")
+        # Of most services the host of an address is no host, but a token.
+        shown = host if str(getattr(plugin, "schema", "")) in HOSTED else ""
+        self.name = f"line {line} ({' '.join(filter(None, (str(plugin.service_name), shown)))})"
         """Without what may be secret."""
-        self._secrets = [each for each in (getattr(plugin, "password", None), getattr(plugin, "user", None)) if each]
+        hidden = (getattr(plugin, "password", None), getattr(plugin, "user", None), "" if shown else host)
+        self._secrets = [str(each) for each in hidden if each]
 
     def send(self, title: str, body: str, *, critical: bool = False, over: bool = False) -> str:
         """Deliver a message; returns why the service did not take it, empty when it did. Waits for the service."""
@@ -60,14 +67,14 @@ class Address:
             with _warnings() as said:
                 taken = self._plugin.notify(body=body, title=title, notify_type=kind)
         except Exception as error:  # noqa: BLE001 - of any of a hundred services
-            return self._reason(repr(error))
+            return self._reason(type(error).__name__)  # what it says may have the address in it
         return "" if taken else self._reason(said.getvalue())
 
     def _reason(self, text: str) -> str:
-        reason = " ".join(text.split())[:MAX_REASON] or "not taken"
+        reason = " ".join(text.split()) or "not taken"
         for secret in self._secrets:
             reason = reason.replace(secret, "***")
-        return reason
+        return reason[:MAX_REASON]
 
 
 @contextlib.contextmanager
@@ -115,6 +122,8 @@ def read_addresses(file: Path) -> tuple[list[Address], list[str]]:
         if plugin is None:
             wrong.append(f"line {number} is no address that Apprise knows")
         elif len(found) < MOST_ADDRESSES:
+            if "overflow=" not in url:  # else a service that takes so many characters refuses each longer message
+                plugin.overflow_mode = apprise.OverflowMode.TRUNCATE
             found.append(Address(number, plugin))
         else:
             wrong.append(f"line {number} is more than {MOST_ADDRESSES} addresses")
@@ -151,7 +160,7 @@ class Delivery:
         self._config, self._fleet = config, fleet
         self._mine, self._ask, self._mark, self._on_change = mine, alerts, mark, on_change
         self._file = config.file
-        self._version: tuple[int, int, int] | None = None
+        self._version: tuple[int, ...] | None = None
         """Of the file whose addresses are used."""
         self._addresses: list[Address] = []
         self._courses: dict[str, Course] = {}
@@ -218,7 +227,11 @@ class Delivery:
 
     async def _deliver(self, address: Address, course: Course, message: Message) -> None:
         critical, over = message.critical, not message.news
-        reason = await _apart(lambda: address.send(message.title, message.body, critical=critical, over=over))
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                reason = await _apart(lambda: address.send(message.title, message.body, critical=critical, over=over))
+        except TimeoutError:
+            reason = f"no answer within {ANSWER_S:g} s"
         if reason:
             self._failed += 1
             course.refused(reason, now=time.monotonic())
@@ -251,20 +264,23 @@ class Delivery:
             log.warning("addresses for alerts are not read", reason=error.message, remedy=error.remedy)
             return
         except Exception as error:  # supervision boundary: of one of Apprise's hundred services
-            self._file_problem = f"{self._file}: {error!r}"
+            self._file_problem = f"{self._file}: {type(error).__name__}"
             log.exception("addresses for alerts are not read")
             return
         self._file_problem = f"{self._file}: {'; '.join(wrong[:3])}" if wrong else ""
         self._courses = {each.name: self._courses.get(each.name, Course()) for each in self._addresses}
+        for course in self._courses.values():
+            if course.failures:
+                course.next_at = float("-inf")  # it may be what was corrected
         log.info("alerts are delivered", to=[each.name for each in self._addresses], problem=self._file_problem)
 
 
-def _version(file: Path) -> tuple[int, int, int] | None:
+def _version(file: Path) -> tuple[int, ...] | None:
     try:
         status = file.stat()
     except OSError:
         return None
-    return status.st_mtime_ns, status.st_size, status.st_ino
+    return status.st_mtime_ns, status.st_ctime_ns, status.st_size, status.st_ino  # ctime: the mode may be corrected
 
 
 async def _apart(work: Callable[[], T]) -> T:

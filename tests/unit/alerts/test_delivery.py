@@ -50,6 +50,17 @@ def test_a_file_without_addresses_is_refused(tmp_path: Path, text: bytes | None,
     assert caught.value.remedy
 
 
+def test_a_token_in_place_of_a_host_is_no_name(tmp_path: Path) -> None:
+    """Of services whose address has a token instead of a host, the service alone is named, in reasons too."""
+    file = tmp_path / "urls"
+    file.write_text(f"pbul://{'a' * 32}\ndiscord://{'1' * 18}/{'b' * 60}\n")
+    found, wrong = read_addresses(file)
+    assert [each.name for each in found] == ["line 1 (Pushbullet)", "line 2 (Discord)"]
+    assert not wrong
+    assert "a" * 32 not in found[0]._reason(f"{'x' * 150} {'a' * 32} failed")
+    assert "aaa" not in found[0]._reason(f"{'x' * 150} {'a' * 32} failed")
+
+
 def test_there_are_only_so_many_addresses(tmp_path: Path) -> None:
     """Further ones are told, not dropped unsaid."""
     file = tmp_path / "urls"
