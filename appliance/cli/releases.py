@@ -1,6 +1,7 @@
 """Releases of the program on this machine: `swiftbot upgrade`, `rollback`, `release …`."""
 
 import os
+import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from rich.text import Text
 
 from appliance import console
 from appliance.cli.common import TOOLS, Json, show
-from appliance.errors import ConfigError, Exit
+from appliance.errors import ConfigError, Exit, RefusedError
 
 if TYPE_CHECKING:
     from appliance.client import FleetClient
@@ -146,7 +147,13 @@ async def upgrade(
         running = next((each.version for each in layout.installed() if each.id == layout.running()), "")
         bundle.check_for(architecture=host.architecture(), python=host.python(), running=running, older=older)
         _say(f"{file}: {bundle.manifest.release}, signature good; {running or 'nothing'} runs")
-        release = await host.lay_out(bundle, layout, config=config, say=_say)
+        try:
+            release = await host.lay_out(bundle, layout, config=config, say=_say)
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise RefusedError(
+                f"{file} cannot be laid out: {getattr(error, 'strerror', None) or error}; what runs was not changed",
+                remedy="make room on the disk, or take another copy of the bundle, and try again",
+            ) from error
         return _show_ended(await upgrading.to(release), as_json=as_json)
 
 

@@ -159,6 +159,8 @@ class InForce:
         self._stamp: tuple[int, int, int] | None = None
         self._why = "" if file is None else f"{file} has not been read"
         self._refused: dict[tuple[Kind, str], str] = {}
+        self._unkept = ""
+        """Why the list that counts is not on the disk: an older one would count after a restart."""
         self._looking = threading.Lock()
 
     @classmethod
@@ -198,7 +200,7 @@ class InForce:
         refused = [f"{kind} {name}" for kind, name in self._refused]
         more = f" and {len(refused) - 3} more" if len(refused) > 3 else ""
         unnamed = f"not in the {_NAME}: {', '.join(refused[:3])}{more}" if refused else ""
-        return "; ".join(filter(None, (self._why, unnamed)))
+        return "; ".join(filter(None, (self._why, unnamed, self._unkept)))
 
     @property
     def text(self) -> str:
@@ -263,7 +265,9 @@ class InForce:
             try:
                 files.write(self._kept, self._sealed, mode=files.PUBLIC)
                 self._kept_number = self._parts.number
+                self._unkept = ""
             except IdentityError as error:
+                self._unkept = f"list {self._parts.number} counts until a restart alone: {error.message}"
                 log.warning("the list of parts cannot be kept", file=str(self._kept), reason=error.message)
 
     def _look(self) -> None:

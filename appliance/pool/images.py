@@ -420,6 +420,7 @@ async def _load(full: str, engine: PodmanEngine, archive: Path, lists: Path, *, 
     layout = ImageLayout(reference=full, image_id=image_id, layers=(digest,))
     await engine.load_image(partial(oci.oci_archive, layout, config, {digest: layer}, {digest: size}))
     if (found := (await engine.image(full)).id) != image_id:
+        await engine.remove_image(full)  # else it would be taken for a good one when it is built again
         raise PrerequisiteError(
             f"Podman loaded {full} as {found[:12]}, not as {image_id[:12]}", remedy="take Podman 4.3 or newer"
         )

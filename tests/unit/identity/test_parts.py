@@ -140,6 +140,18 @@ def test_a_list_that_is_handed_on_counts_if_the_authority_signed_it(tmp_path: Pa
     assert InForce(file, authority=KEY.public_key(), fleet="yard", kept=kept).number == 0
 
 
+def test_a_list_that_cannot_be_kept_is_a_problem_until_it_is(tmp_path: Path) -> None:
+    """After a restart an older one would count: that is shown, and over once the disk takes it."""
+    kept = tmp_path / "gone" / "kept.json"
+    counts = InForce(tmp_path / parts.FILE, authority=KEY.public_key(), fleet="yard", kept=kept)
+    counts.take(parts.seal(listed(3), KEY))
+    counts.keep()
+    assert "list 3 counts until a restart alone" in counts.problem
+    kept.parent.mkdir()
+    counts.keep()
+    assert counts.problem == ""
+
+
 def test_another_list_of_the_same_number_is_told(tmp_path: Path) -> None:
     """As by an authority that was restored from an old backup: the one that counts stays, and the remedy is named."""
     counts = in_force(tmp_path, parts.seal(listed(2), KEY))
